@@ -1,0 +1,67 @@
+"""The one place where kernels are compiled.
+
+Every hot loop of the package is a function decorated with `kernel`.  It is compiled by numba in
+nopython mode, without fast-math (so that the same samples give the same bits whatever the block
+partition) and without the GIL, and the machine code is cached on disk.
+
+numba's own cache notices a change of the file a kernel stands in, but not of a file whose kernels it
+calls.  A `git pull` could therefore leave stale machine code behind; so the cache folder carries a
+digest of every source file of the package that holds kernels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+_PACKAGE = Path(__file__).resolve().parent
+_CACHES_KEPT = 4
+
+
+def _kernel_digest() -> str:
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        source = path.read_bytes()
+        if b"@kernel" in source:
+            digest.update(path.relative_to(_PACKAGE).as_posix().encode())
+            digest.update(source)
+    return digest.hexdigest()[:16]
+
+
+def _cache_root() -> Path:
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "ipmsm_can"
+
+
+def _select_cache() -> None:
+    root = _cache_root()
+    folder = root / f"kernels-{_kernel_digest()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        older = sorted(root.glob("kernels-*"), key=lambda p: p.stat().st_mtime)[:-_CACHES_KEPT]
+        for path in older:
+            shutil.rmtree(path, ignore_errors=True)
+    except OSError:
+        return  # a read-only home: numba then falls back to __pycache__ or a folder of its own
+    numba.config.CACHE_DIR = str(folder)
+
+
+_select_cache()
+
+
+def kernel(function: _F) -> _F:
+    """Compile `function` as a cached nopython kernel; a division by zero gives inf or nan, as in NumPy."""
+    compiled: _F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return compiled
