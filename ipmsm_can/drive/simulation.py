@@ -1,0 +1,352 @@
+"""The whole simulated drive, sample by sample: profile, sensors, control, injection, inverter, machine.
+
+One compiled loop runs a block of samples over explicit state, so blocks of any size give the same bits.
+
+Time line.  At t_k the current is sampled; control and injection then make the voltage for the interval
+t_(k+1) to t_(k+2), while the voltage made at t_(k-1) is being applied.  Sample k reports the current at
+t_k and the commanded voltage of the interval that ended at t_k, which is exactly its mean; an injection
+command given before sample k therefore first shows in the voltage of sample k + 2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.drive import control, machine
+from ipmsm_can.drive.control import current_step, speed_step
+from ipmsm_can.drive.inverter import measure_current
+from ipmsm_can.drive.machine import (
+    M_L_Q,
+    M_POLE_PAIRS,
+    X_LAMBDA_ALPHA,
+    X_LAMBDA_BETA,
+    X_OMEGA_M,
+    X_THETA_M,
+    advance,
+    air_gap_torque,
+    stationary_current,
+    wrap,
+)
+from ipmsm_can.drive.profile import Profile, value_at
+from ipmsm_can.injection import waveform as probing
+from ipmsm_can.motor import Motor
+
+Array = NDArray[np.float64]
+
+# Drive parameters beyond machine and control, float64 (D_SIZE,)
+D_PERIOD = 0  # s
+D_SUBSTEPS = 1
+D_FREE_SHAFT = 2
+D_LOCKED = 3
+D_DEAD_TIME_VOLTAGE = 4  # V
+D_DEAD_TIME_ZONE = 5  # A
+D_CURRENT_NOISE = 6  # A
+D_OFFSET_ALPHA = 7  # A
+D_OFFSET_BETA = 8  # A
+D_ADC_STEP = 9  # A
+D_INJECTION_LIMIT = 10  # V
+D_INJECTION_RAMP = 11  # V/s
+D_SIZE = 12
+
+# Voltage state, float64 (V_SIZE,): (alpha, beta) of the interval that ended, then of the one that begins
+V_ENDED = 0
+V_BEGINS = 2
+V_INJ_ENDED = 4
+V_INJ_BEGINS = 6
+V_SIZE = 8
+
+_FINEST_CURRENT_LOOP = 12.0
+"""Least ratio of sample rate to current bandwidth: with 1.5 periods of delay it leaves 45 deg of phase."""
+
+
+@dataclass(frozen=True)
+class DriveParameters:
+    """Settings of the simulated drive.
+
+    sample_rate: control periods per second [Hz], 100..1e6.
+    substeps: RK4 steps in a control period, 1..1000.
+    v_dc: dc-link voltage [V], > 0; the voltage limit is v_dc / sqrt(3) [V peak].
+    current_bandwidth_hz: bandwidth of the current loops [Hz], > 0 and at most sample_rate / 12.
+    speed_bandwidth_hz: bandwidth of the speed loop [Hz], > 0 and at most current_bandwidth_hz / 4.
+    torque_limit: [N m], > 0; None stands for 1.5 times the rated torque.
+    i_max: largest current reference [A peak], > 0; None stands for twice the rated current.
+    mtpa: maximum torque per ampere instead of i_d = 0.
+    dead_time_voltage: voltage each phase loses, against its current [V], >= 0.
+    dead_time_zone: current below which that loss fades out [A], > 0.
+    current_noise: standard deviation of the sensor noise per axis (alpha, beta) [A], >= 0.
+    current_offset: sensor offset (alpha, beta) [A].
+    adc_step: resolution of the current samples [A], 0 for none.
+    friction: viscous [N m s/rad mechanical], >= 0.
+    speed_imposed: a load machine makes the rotor follow the profile's speed exactly; the drive then
+        controls torque, and the profile's load torque is its torque reference.
+    rotor_locked: the rotor stays where it starts; torque control as above.
+    injection_limit: largest probing amplitude [V peak], >= 0, whatever is asked.
+    injection_ramp: fastest change of the probing amplitude [V/s], > 0.
+
+    Raises ValueError naming the setting, what it got and what it allows.
+    """
+
+    sample_rate: float = 10_000.0
+    substeps: int = 10
+    v_dc: float = 540.0
+    current_bandwidth_hz: float = 200.0
+    speed_bandwidth_hz: float = 15.0
+    torque_limit: float | None = None
+    i_max: float | None = None
+    mtpa: bool = False
+    dead_time_voltage: float = 0.0
+    dead_time_zone: float = 0.2
+    current_noise: float = 0.02
+    current_offset: tuple[float, float] = (0.0, 0.0)
+    adc_step: float = 0.0
+    friction: float = 0.0
+    speed_imposed: bool = False
+    rotor_locked: bool = False
+    injection_limit: float = 30.0
+    injection_ramp: float = 1000.0
+
+    def __post_init__(self) -> None:
+        _within("sample_rate", self.sample_rate, 100.0, 1e6, "Hz")
+        if not (isinstance(self.substeps, int) and 1 <= self.substeps <= 1000):
+            raise ValueError(f"substeps is {self.substeps!r}; allowed is a whole number from 1 to 1000")
+        _within("current_bandwidth_hz", self.current_bandwidth_hz, 1e-3,
+                self.sample_rate / _FINEST_CURRENT_LOOP, "Hz (a twelfth of sample_rate)")
+        _within("speed_bandwidth_hz", self.speed_bandwidth_hz, 1e-3, self.current_bandwidth_hz / 4.0,
+                "Hz (a quarter of current_bandwidth_hz)")
+        for name, unit in (("v_dc", "V"), ("dead_time_zone", "A"), ("injection_ramp", "V/s"),
+                           ("torque_limit", "N m"), ("i_max", "A")):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value!r}; allowed is a finite number above 0, in {unit}")
+        for name, unit in (("dead_time_voltage", "V"), ("current_noise", "A"), ("adc_step", "A"),
+                           ("friction", "N m s/rad"), ("injection_limit", "V")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} is {value!r}; allowed is a finite number of 0 or more, in {unit}")
+        if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
+            raise ValueError(f"current_offset is {self.current_offset!r}; "
+                             "allowed are two finite numbers, in A")
+        if self.speed_imposed and self.rotor_locked:
+            raise ValueError("speed_imposed and rotor_locked are both true; allowed is one of them at most")
+
+    @property
+    def v_max(self) -> float:
+        """Largest voltage the inverter gives in every direction [V peak]."""
+        return self.v_dc / math.sqrt(3.0)
+
+    def noise_free(self) -> DriveParameters:
+        """The same drive with perfect current sensors."""
+        return replace(self, current_noise=0.0, current_offset=(0.0, 0.0), adc_step=0.0)
+
+    def torque_max(self, motor: Motor) -> float:
+        """Largest torque reference [N m]: the torque limit, or what i_max gives if that is less."""
+        limit = 1.5 * motor.rated_torque if self.torque_limit is None else self.torque_limit
+        i_max = 2.0 * motor.rated_current if self.i_max is None else self.i_max
+        return min(limit, control.torque_at_current(motor, i_max, self.mtpa))
+
+
+def _within(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g} {unit}")
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSamples:
+    """n samples in order; float64 (n,) unless said otherwise.  Peak, amplitude-invariant.
+
+    sample: int64, sample counter, 0 for the first sample of the simulation.
+    i_alpha, i_beta: measured current at t_k [A], with noise, offset and ADC steps.
+    v_alpha, v_beta: mean commanded voltage over the interval that ended at t_k [V].
+    theta_e: true rotor angle at t_k [rad electrical], -pi..pi.  omega_e: true speed [rad/s electrical].
+    i_d, i_q: true current [A].  torque: air-gap torque [N m].
+    load_torque: the profile's load torque [N m] (the torque reference with an imposed or locked rotor).
+    active_flux: psi_m + L_0 i_d [Wb], length of the paper's x, which points along theta_e.
+    v_inj_alpha, v_inj_beta: probing part of the voltage [V], as it was before the voltage limit.
+    speed_reference: the profile's speed [rad/s mechanical].
+    injection_waveform, injection_amplitude: probing waveform (0..3) and its amplitude [V peak] as decided
+        at t_k, for the interval from t_(k+1) on.
+    """
+
+    sample: NDArray[np.int64]
+    i_alpha: Array
+    i_beta: Array
+    v_alpha: Array
+    v_beta: Array
+    theta_e: Array
+    omega_e: Array
+    i_d: Array
+    i_q: Array
+    torque: Array
+    load_torque: Array
+    active_flux: Array
+    v_inj_alpha: Array
+    v_inj_beta: Array
+    speed_reference: Array
+    injection_waveform: Array
+    injection_amplitude: Array
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+
+O_SIZE = len(fields(DriveSamples)) - 1
+"""Rows of the kernel's output: the fields of DriveSamples after `sample`, in their order."""
+
+
+@kernel
+def _simulate(
+    out: Array, first: int, noise: Array, x: Array, s: Array, v: Array, inj: Array, m: Array, c: Array,
+    d: Array, speed_track: Array, load_track: Array,
+) -> None:
+    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2); x, s, v, inj are the state, moved on."""
+    period = d[D_PERIOD]
+    substeps = int(d[D_SUBSTEPS])
+    free_shaft = d[D_FREE_SHAFT] != 0.0
+    locked = d[D_LOCKED] != 0.0
+    pole_pairs = m[M_POLE_PAIRS]
+    for j in range(out.shape[1]):
+        k = float(first + j)
+        reference = value_at(speed_track, k, False)
+        load = value_at(load_track, k, False)
+        if not free_shaft:
+            x[X_OMEGA_M] = 0.0 if locked else reference
+        omega_m = x[X_OMEGA_M]
+        omega_e = pole_pairs * omega_m
+        theta_e = wrap(pole_pairs * x[X_THETA_M])
+        lambda_alpha = x[X_LAMBDA_ALPHA]
+        lambda_beta = x[X_LAMBDA_BETA]
+        i_alpha, i_beta = stationary_current(lambda_alpha, lambda_beta, theta_e, m)
+        cos_k = math.cos(theta_e)
+        sin_k = math.sin(theta_e)
+        i_d = cos_k * i_alpha + sin_k * i_beta
+        measured_alpha = measure_current(i_alpha, d[D_CURRENT_NOISE] * noise[j, 0], d[D_OFFSET_ALPHA],
+                                         d[D_ADC_STEP])
+        measured_beta = measure_current(i_beta, d[D_CURRENT_NOISE] * noise[j, 1], d[D_OFFSET_BETA],
+                                        d[D_ADC_STEP])
+        out[0, j] = measured_alpha
+        out[1, j] = measured_beta
+        out[2, j] = v[V_ENDED]
+        out[3, j] = v[V_ENDED + 1]
+        out[4, j] = theta_e
+        out[5, j] = omega_e
+        out[6, j] = i_d
+        out[7, j] = cos_k * i_beta - sin_k * i_alpha
+        out[8, j] = air_gap_torque(lambda_alpha, lambda_beta, i_alpha, i_beta, m)
+        out[9, j] = load
+        out[10, j] = cos_k * lambda_alpha + sin_k * lambda_beta - m[M_L_Q] * i_d
+        out[11, j] = v[V_INJ_ENDED]
+        out[12, j] = v[V_INJ_ENDED + 1]
+        out[13, j] = reference
+
+        inj_alpha, inj_beta = probing.step(inj, period, d[D_INJECTION_RAMP], d[D_INJECTION_LIMIT])
+        out[14, j] = inj[probing.W_WAVEFORM]
+        out[15, j] = inj[probing.W_AMPLITUDE]
+        torque = speed_step(s, c, omega_m, reference) if free_shaft else load
+        v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta_e, omega_e, torque,
+                                       inj_alpha, inj_beta)
+
+        load_mean = 0.5 * (load + value_at(load_track, k + 1.0, True))
+        omega_end = 0.0 if locked else value_at(speed_track, k + 1.0, True)
+        advance(x, v[V_BEGINS], v[V_BEGINS + 1], load_mean, period, substeps, free_shaft, omega_end,
+                d[D_DEAD_TIME_VOLTAGE], d[D_DEAD_TIME_ZONE], m)
+        for axis in range(2):
+            v[V_ENDED + axis] = v[V_BEGINS + axis]
+            v[V_INJ_ENDED + axis] = v[V_INJ_BEGINS + axis]
+        v[V_BEGINS] = v_alpha
+        v[V_BEGINS + 1] = v_beta
+        v[V_INJ_BEGINS] = inj_alpha
+        v[V_INJ_BEGINS + 1] = inj_beta
+
+
+class DriveSimulation:
+    """A simulated drive that runs a profile, block by block.
+
+    motor, parameters, profile: what is simulated.  theta_0: rotor angle at the start [rad electrical].
+    seed: of the sensor noise.  The rotor starts at the profile's first speed without current, as after a
+    catch of a spinning machine: the voltage before and at the start is the magnet's.
+    """
+
+    def __init__(
+        self, motor: Motor, parameters: DriveParameters, profile: Profile, theta_0: float = 0.0, seed: int = 0
+    ) -> None:
+        if not math.isfinite(theta_0):
+            raise ValueError(f"theta_0 is {theta_0!r}; allowed is a finite angle, in rad electrical")
+        self.motor = motor
+        self.parameters = parameters
+        self.profile = profile
+        p = parameters
+        period = 1.0 / p.sample_rate
+        self._machine = machine.pack_machine(motor, p.friction)
+        self._control = control.pack_control(motor, period, p.current_bandwidth_hz, p.speed_bandwidth_hz,
+                                             p.torque_max(motor), p.v_max, p.mtpa)
+        self._drive = np.array([
+            period, p.substeps, not (p.speed_imposed or p.rotor_locked), p.rotor_locked,
+            p.dead_time_voltage, p.dead_time_zone, p.current_noise, *p.current_offset, p.adc_step,
+            p.injection_limit, p.injection_ramp,
+        ], dtype=np.float64)
+        self._speed_track, self._load_track = profile.tracks(p.sample_rate)
+        omega_m = 0.0 if p.rotor_locked else value_at(self._speed_track, 0.0, False)
+        self._x = machine.initial_state(motor, theta_0, omega_m)
+        self._s = np.zeros(control.S_SIZE)
+        self._v = np.zeros(V_SIZE)
+        omega_e = motor.pole_pairs * omega_m
+        for place, middle in ((V_ENDED, -0.5), (V_BEGINS, 0.5)):
+            angle = theta_0 + middle * omega_e * period
+            self._v[place] = -omega_e * motor.psi_m * math.sin(angle)
+            self._v[place + 1] = omega_e * motor.psi_m * math.cos(angle)
+        self._injection = np.zeros(probing.W_SIZE)
+        self._noise = np.random.default_rng(seed)
+        self._next = 0
+
+    @property
+    def next_sample(self) -> int:
+        """Counter of the sample that the next `run` begins with."""
+        return self._next
+
+    @property
+    def samples_in_profile(self) -> int:
+        """Samples until the end of the profile; `run` may go on beyond it, with its last values."""
+        return round(self.profile.duration * self.parameters.sample_rate)
+
+    def command_injection(
+        self, waveform: int, amplitude: float, frequency: float, axis_angle: float, ttl_samples: int
+    ) -> None:
+        """Ask for a probing waveform from the next sample on, for ttl_samples samples.
+
+        waveform: 0 off, 1 rotating, 2 pulsating, 3 polarity_pulses.  amplitude [V peak], >= 0, cut to the
+        drive's own limit.  frequency [Hz], above 0 and at most half the sample rate.  axis_angle
+        [rad electrical].  With waveform 0 only ttl_samples counts of the rest: the old one ramps down.
+
+        Raises ValueError naming the argument; the command in force then stays.
+        """
+        nyquist = 0.5 * self.parameters.sample_rate
+        if waveform not in (0, 1, 2, 3):
+            raise ValueError(f"waveform is {waveform!r}; allowed is 0 to 3")
+        if ttl_samples < 0:
+            raise ValueError(f"ttl_samples is {ttl_samples!r}; allowed is 0 or more")
+        if waveform == 0:
+            amplitude, frequency, axis_angle = 0.0, nyquist, 0.0
+        if not (math.isfinite(amplitude) and amplitude >= 0.0):
+            raise ValueError(f"amplitude is {amplitude!r}; allowed is a finite number of 0 or more, in V")
+        if not 0.0 < frequency <= nyquist:
+            raise ValueError(f"frequency is {frequency!r}; allowed is above 0 and up to {nyquist:g} Hz")
+        if not math.isfinite(axis_angle):
+            raise ValueError(f"axis_angle is {axis_angle!r}; allowed is a finite angle, in rad electrical")
+        probing.ask(self._injection, waveform, amplitude, frequency, axis_angle, ttl_samples)
+
+    def run(self, n: int) -> DriveSamples:
+        """The next n samples, n >= 0."""
+        if n < 0:
+            raise ValueError(f"n is {n!r}; allowed is 0 or more samples")
+        out = np.empty((O_SIZE, n))
+        noise = self._noise.standard_normal((n, 2))
+        _simulate(out, self._next, noise, self._x, self._s, self._v, self._injection, self._machine,
+                  self._control, self._drive, self._speed_track, self._load_track)
+        sample = np.arange(self._next, self._next + n, dtype=np.int64)
+        self._next += n
+        return DriveSamples(sample, *out)
