@@ -1,0 +1,335 @@
+"""The configuration of one drive as frozen models: sections, keys, defaults and what must fit together.
+
+`ipmsm_can.config.load` builds a `DriveConfig` from a TOML file and words the messages;
+`ipmsm_can.config.explain` prints the same keys with their descriptions.  Plain numbers are SI unless a
+key says otherwise; speeds and angles are electrical, voltages and currents of probing signals are peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
+
+from ipmsm_can.config import units
+from ipmsm_can.config.keys import Choice, FilePath, Key, Quantity, Switch
+from ipmsm_can.motor import PRESETS, Motor
+
+ObserverKind = Literal["ges"]
+OBSERVER_KINDS: tuple[str, ...] = get_args(ObserverKind)
+"""The observers a configuration may ask for; the one list of them."""
+
+Waveform = Literal["rotating", "pulsating"]
+
+ROTATING_CONVERGENCE = 70.0
+"""Convergence rate gamma |Phi|^2 [1/s] of a fast-turning rotor that the default gamma gives."""
+
+CURRENT_LIMIT_SHARE = 0.15
+"""Default limit of the high-frequency current as a share of the rated current."""
+
+
+class KeyProblem(ValueError):
+    """Keys that do not fit together.  key: the one to blame, dotted or inside the section; allowed: in words.
+
+    missing: the key has to be there and is not.
+    """
+
+    def __init__(self, key: str, allowed: str, missing: bool = False) -> None:
+        super().__init__(f"{key}: allowed is {allowed}")
+        self.key = key
+        self.allowed = allowed
+        self.missing = missing
+
+
+class Section(BaseModel):
+    """A table of the file: every field is a key and carries one `Key` that reads and describes it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @classmethod
+    def keys(cls) -> dict[str, Key]:
+        """The keys of the section in their order."""
+        return {
+            name: next(item for item in field.metadata if isinstance(item, Key))
+            for name, field in cls.model_fields.items()
+        }
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _read(cls, value: Any, info: ValidationInfo) -> Any:
+        assert info.field_name is not None
+        return cls.keys()[info.field_name].read(value)
+
+
+_FROM_PRESET = "from the preset"
+_MOTOR_NEEDS = ("pole_pairs", "psi_m", "L_d", "L_q", "R")
+
+
+class MotorConfig(Section):
+    """The motor: a preset, a preset with single values replaced, or pole_pairs, psi_m, L_d, L_q and R."""
+
+    preset: Annotated[str | None, Choice(
+        doc="Motor to start from: m1 and m2 are the simulation and the experiment motor of the paper.",
+        choices=tuple(PRESETS), default="none", example="m2")] = None
+    pole_pairs: Annotated[int | None, Quantity(
+        doc="Number of pole pairs.", whole=True, least=1, most=100, default=_FROM_PRESET, example=3)] = None
+    psi_m: Annotated[float | None, Quantity(
+        doc="Flux linkage of the permanent magnets, peak, per phase.",
+        unit=units.WEBER, least=1e-6, most=10, default=_FROM_PRESET, example="590 mWb")] = None
+    L_d: Annotated[float | None, Quantity(
+        doc="d-axis inductance.",
+        unit=units.HENRY, least=1e-7, most=1, default=_FROM_PRESET, example="7.6 mH")] = None
+    L_q: Annotated[float | None, Quantity(
+        doc="q-axis inductance.",
+        unit=units.HENRY, least=1e-7, most=1, default=_FROM_PRESET, example="12.9 mH")] = None
+    R: Annotated[float | None, Quantity(
+        doc="Stator resistance per phase, at working temperature.",
+        unit=units.OHM, least=0, most=1000, default=_FROM_PRESET, example="1.059 ohm")] = None
+    J: Annotated[float | None, Quantity(
+        doc="Inertia at the shaft, used by the simulated drive only.", unit=units.INERTIA, above=0, most=1e6,
+        default=f"{_FROM_PRESET}, or {Motor.__dataclass_fields__['J'].default}",
+        example="100 kg cm^2")] = None
+    rated_torque: Annotated[float | None, Quantity(
+        doc="Rated torque; the default of injection.current_limit comes from it.",
+        unit=units.NEWTON_METRE, above=0, most=1e6, default=_FROM_PRESET, example="6.2 N m")] = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> MotorConfig:
+        if self.preset is None:
+            for name in _MOTOR_NEEDS:
+                if getattr(self, name) is None:
+                    presets = " or ".join(f'preset = "{preset}"' for preset in PRESETS)
+                    raise KeyProblem(name, f"{self.keys()[name].allowed}, or take {presets}", missing=True)
+        return self
+
+    def build(self) -> Motor:
+        """The motor's parameters."""
+        given = self.model_dump(exclude={"preset"}, exclude_none=True)
+        if self.preset is None:
+            return Motor(**given)
+        base = PRESETS[self.preset]
+        values = {name: getattr(base, name) for name in Motor.__dataclass_fields__}
+        return Motor(**{**values, **given, "name": f"{base.name} with changes" if given else base.name})
+
+
+class WireConfig(Section):
+    """What is on the bus."""
+
+    node: Annotated[int, Quantity(
+        doc="Number of the drive on the bus; it is added to every CAN identifier.",
+        whole=True, least=0, most=15)] = 0
+    dbc: Annotated[Path | None, FilePath(
+        doc="DBC file with this project's messages in other scalings or identifiers.",
+        default="the one that comes with the program", example="ipmsm_can.dbc")] = None
+    sample_rate: Annotated[float | None, Quantity(
+        doc="Samples per second, used until the drive sends DriveTiming, or if it never does.",
+        unit=units.HERTZ, least=100, most=100e3, default="wait for DriveTiming", example="10 kHz")] = None
+    max_gap: Annotated[int, Quantity(
+        doc="Longest run of lost samples that is filled by interpolation; a longer one restarts the filters.",
+        unit=units.SAMPLES, whole=True, least=0, most=64)] = 8
+    bitrate: Annotated[int, Quantity(
+        doc="Nominal bit rate, for the bus load.",
+        unit=units.BIT_RATE, whole=True, least=10_000, most=1_000_000)] = 1_000_000
+    data_bitrate: Annotated[int, Quantity(
+        doc="Bit rate of the data phase of CAN FD, for the bus load; not below bitrate.",
+        unit=units.BIT_RATE, whole=True, least=10_000, most=8_000_000)] = 5_000_000
+
+    @field_validator("dbc", mode="after")
+    @classmethod
+    def _beside_the_file(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        if path is not None:
+            path = Path((info.context or {}).get("folder", ".")) / path
+            if not path.is_file():
+                raise ValueError(cls.keys()["dbc"].allowed)
+        return path
+
+    @model_validator(mode="after")
+    def _consistent(self) -> WireConfig:
+        if self.data_bitrate < self.bitrate:
+            raise KeyProblem("data_bitrate", f"wire.bitrate ({self.bitrate} bit/s) or more")
+        return self
+
+
+class ObserverConfig(Section):
+    """The position observer and what it may assume about the samples."""
+
+    kind: Annotated[ObserverKind, Choice(
+        doc="Observer; ges is the one of the paper's Proposition 1.", choices=OBSERVER_KINDS)] = "ges"
+    alpha: Annotated[float, Quantity(
+        doc="Bandwidth of the regression's filters (the paper's alpha).",
+        unit=units.PER_SECOND, least=1e-3, most=1e5)] = 10.0
+    gamma: Annotated[float | None, Quantity(
+        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly.",
+        unit=units.GRADIENT_GAIN, above=0,
+        default=f"{ROTATING_CONVERGENCE:g} 1/s / (2 alpha psi_m)^2, which converges at "
+                f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed", example=0.5)] = None
+    initial_flux: Annotated[tuple[float, float], Quantity(
+        doc="Stator flux linkage (alpha, beta) the observer starts from; with the default it starts from no "
+            "assumed angle.", unit=units.WEBER, count=2)] = (0.0, 0.0)
+    epsilon: Annotated[float | None, Quantity(
+        doc="Active flux below which its direction sigma(x) counts as unknown and is 0; less than psi_m.",
+        unit=units.WEBER, above=0, default="psi_m / 10", example="59 mWb")] = None
+    excitation_window: Annotated[float, Quantity(
+        doc="Length of the window over which excitation, the smallest eigenvalue of the integral of "
+            "Phi Phi^T, is judged.", unit=units.SECOND, above=0, most=10)] = 0.1
+    speed_bandwidth: Annotated[float, Quantity(
+        doc="Natural frequency of the phase-locked loop that gives the speed.",
+        unit=units.HERTZ, above=0, most=1000)] = 20.0
+    voltage_uncertainty: Annotated[float, Quantity(
+        doc="What the reported mean voltage may be wrong by (dead time, offsets); widens the reported sigma.",
+        unit=units.VOLT, least=0)] = 0.5
+    current_noise: Annotated[float, Quantity(
+        doc="Noise of the sampled currents, per axis.", unit=units.AMPERE_RMS, above=0)] = 0.02
+
+
+class EstimateConfig(Section):
+    """What the companion reports, and how often; never more often than samples come in."""
+
+    rate: Annotated[float, Quantity(
+        doc="PositionEstimate messages per second.", unit=units.HERTZ, least=1, most=20e3)] = 1000.0
+    flux_rate: Annotated[float, Quantity(
+        doc="ActiveFluxEstimate messages per second.", unit=units.HERTZ, least=1, most=20e3)] = 50.0
+    status_rate: Annotated[float, Quantity(
+        doc="CompanionStatus messages per second.", unit=units.HERTZ, least=1, most=1e3)] = 10.0
+    valid_sigma: Annotated[float, Quantity(
+        doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical).",
+        unit=units.DEGREE, above=0, most=90)] = 10.0
+
+
+class InjectionConfig(Section):
+    """The probing signal: when, how strong, which waveform. Nothing is sent without --transmit."""
+
+    enabled: Annotated[bool, Switch(doc="Whether injection commands may be sent at all.")] = True
+    waveform: Annotated[Waveform, Choice(
+        doc="rotating in the stationary frame, or pulsating along the estimated d-axis.",
+        choices=get_args(Waveform))] = "rotating"
+    amplitude: Annotated[float, Quantity(
+        doc="Amplitude of the injected voltage.", unit=units.VOLT_PEAK, above=0, most=1000)] = 6.0
+    frequency: Annotated[float, Quantity(
+        doc="Frequency of the injected voltage; less than half of wire.sample_rate.",
+        unit=units.HERTZ, least=1, most=20e3)] = 400.0
+    speed_on: Annotated[float, Quantity(
+        doc="Injection starts below this speed. Hz is the electrical frequency, rpm the shaft's speed.",
+        unit=units.SPEED, least=0)] = 40.0
+    speed_off: Annotated[float, Quantity(
+        doc="Injection stops above this speed; above speed_on. Hz and rpm as there.",
+        unit=units.SPEED, above=0)] = 60.0
+    excitation_on: Annotated[float, Quantity(
+        doc="Injection also starts when excitation falls below this, whatever the speed; 0 = judge by speed "
+            "only. A turning rotor gives 2 (alpha psi_m)^2 excitation_window at high speed.",
+        unit=units.EXCITATION, least=0)] = 0.0
+    excitation_off: Annotated[float, Quantity(
+        doc="Excitation above which the former reason to inject ends; above excitation_on, or both 0.",
+        unit=units.EXCITATION, least=0)] = 0.0
+    ramp: Annotated[float, Quantity(
+        doc="Rate at which the amplitude rises and falls.", unit=units.VOLT_PER_SECOND, above=0)] = 60.0
+    current_limit: Annotated[float | None, Quantity(
+        doc="Limit of the high-frequency current; the amplitude is reduced to stay below it.",
+        unit=units.AMPERE_PEAK, above=0,
+        default=f"{100 * CURRENT_LIMIT_SHARE:g} % of the current that gives motor.rated_torque",
+        example="350 mA")] = None
+    time_to_live: Annotated[float, Quantity(
+        doc="A drive stops injecting when the last command is older than this.",
+        unit=units.SECOND, above=0, most=0.5)] = 0.1
+    period: Annotated[float, Quantity(
+        doc="Time between repeated commands; below half of time_to_live, so that one may get lost.",
+        unit=units.SECOND, above=0)] = 0.02
+
+    @model_validator(mode="after")
+    def _consistent(self) -> InjectionConfig:
+        if self.speed_off <= self.speed_on:
+            raise KeyProblem(
+                "speed_off", f"a speed above injection.speed_on, {self.speed_on:g} rad/s electrical")
+        if self.excitation_off <= self.excitation_on and (self.excitation_on, self.excitation_off) != (0, 0):
+            raise KeyProblem(
+                "excitation_off",
+                f"a value above injection.excitation_on, {self.excitation_on:g} V^2 s, or 0 for both")
+        if self.period >= self.time_to_live / 2:
+            raise KeyProblem(
+                "period", f"a time below half of injection.time_to_live, {self.time_to_live:g} s")
+        return self
+
+
+class DriveConfig(BaseModel):
+    """The configuration of one drive; [motor] is required, every other section has its defaults.
+
+    Raises pydantic.ValidationError (a ValueError) when built directly; `load_config` turns it into one
+    sentence.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    motor: MotorConfig
+    wire: WireConfig = WireConfig()
+    observer: ObserverConfig = ObserverConfig()
+    estimate: EstimateConfig = EstimateConfig()
+    injection: InjectionConfig = InjectionConfig()
+
+    @classmethod
+    def sections(cls) -> dict[str, type[Section]]:
+        """The sections in the order of the file."""
+        fields: Iterable[tuple[str, Any]] = cls.model_fields.items()
+        return {name: field.annotation for name, field in fields}
+
+    @field_validator("injection", mode="before")
+    @classmethod
+    def _shaft_speeds(cls, value: Any, info: ValidationInfo) -> Any:
+        # rpm counts turns of the shaft: only here are the pole pairs known.  Without a valid motor the
+        # values are left out, so that the message is about the motor alone.
+        if not isinstance(value, dict):
+            return value
+        motor = info.data.get("motor")
+        result = dict(value)
+        for name, key in InjectionConfig.keys().items():
+            if isinstance(key, Quantity) and key.unit.is_shaft(value.get(name)):
+                if isinstance(motor, MotorConfig):
+                    try:
+                        result[name] = key.read(value[name], motor.build().pole_pairs)
+                    except ValueError as problem:
+                        raise KeyProblem(name, str(problem)) from None
+                else:
+                    del result[name]
+        return result
+
+    @model_validator(mode="after")
+    def _consistent(self) -> DriveConfig:
+        psi_m = self.motor.build().psi_m
+        if self.epsilon >= psi_m:
+            raise KeyProblem("observer.epsilon", f"a flux below the motor's psi_m, {psi_m:g} Wb")
+        rate = self.wire.sample_rate
+        if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
+            raise KeyProblem(
+                "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")
+        if (self.injection.enabled and self.injection.current_limit is None
+                and self.motor.preset is None and self.motor.rated_torque is None):
+            # Motor's own default torque belongs to the paper's machines: no basis for a limit elsewhere.
+            raise KeyProblem(
+                "injection.current_limit",
+                f"{InjectionConfig.keys()['current_limit'].allowed}, or motor.rated_torque to derive it "
+                "from, or injection.enabled = false", missing=True)
+        return self
+
+    def build_motor(self) -> Motor:
+        """The motor's parameters."""
+        return self.motor.build()
+
+    @property
+    def gamma(self) -> float:
+        """Observer gain [1/(V^2 s)]: the given one, or 70 1/s over (2 alpha psi_m)^2."""
+        if self.observer.gamma is not None:
+            return self.observer.gamma
+        return float(ROTATING_CONVERGENCE / (2.0 * self.observer.alpha * self.motor.build().psi_m) ** 2)
+
+    @property
+    def epsilon(self) -> float:
+        """Active flux [Wb] below which sigma(x) is 0: the given one, or psi_m / 10."""
+        given = self.observer.epsilon
+        return given if given is not None else self.motor.build().psi_m / 10.0
+
+    @property
+    def current_limit(self) -> float:
+        """Limit of the high-frequency current [A peak]: the given one, or 15 % of the rated current."""
+        given = self.injection.current_limit
+        return given if given is not None else CURRENT_LIMIT_SHARE * self.motor.build().rated_current
