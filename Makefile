@@ -1,0 +1,40 @@
+# Plain entry points; each sets up .venv first (tools/setup), which takes no time when nothing changed.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help demo test bench lint clean
+PYTHON := .venv/bin/python
+
+help:
+	@echo "make demo    set up, then run a simulated drive and the companion side by side"
+	@echo "make test    set up, then check style and types and run all tests"
+	@echo "make lint    check style and types only"
+	@echo "make bench   measure the hot paths"
+	@echo "make clean   remove everything that was generated, .venv included"
+
+demo:
+	@tools/setup run
+	.venv/bin/ipmsm-can demo
+
+lint:
+	@tools/setup test
+	.venv/bin/ruff check .
+	.venv/bin/mypy --strict
+
+test: lint
+	$(PYTHON) -m pytest -m "not vcan"
+	@# Exit code 77 of tools/vcan/run: no CAN interface can be had here.
+	@code=0; \
+	tools/vcan/run env IPMSM_CAN_REQUIRE_VCAN=1 $(PYTHON) -m pytest tests/vcan || code=$$?; \
+	if [ $$code = 77 ] && [ "$$CI" = true ]; then \
+		echo "make test: FAILED: the tests on a real CAN interface must run where CI=true"; exit 1; \
+	elif [ $$code = 77 ]; then \
+		echo "make test: SKIPPED: the tests on a real CAN interface (tests/vcan)"; \
+	else exit $$code; fi
+
+bench:
+	@tools/setup test
+	$(PYTHON) -m tools.bench
+
+clean:
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist out *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
