@@ -27,11 +27,11 @@ def test_between_breakpoints_it_is_linear_and_outside_held(
 
 
 def test_two_points_at_one_time_are_a_step_on_exactly_one_sample() -> None:
-    profile = Profile(((0.0, 1.0), (0.3, 1.0), (0.3, 5.0)))
-    track, _ = profile.tracks(10_000.0)  # 0.3 * 10000 is not 3000 in binary
-    assert value_at(track, 2999.0, False) == 1.0
-    assert value_at(track, 3000.0, True) == 1.0
-    assert value_at(track, 3000.0, False) == 5.0
+    assert 0.035 * 10_000.0 > 350.0  # the product of the two doubles is not the whole number that is meant
+    track, _ = Profile(((0.0, 1.0), (0.035, 1.0), (0.035, 5.0))).tracks(10_000.0)
+    assert value_at(track, 349.0, False) == 1.0
+    assert value_at(track, 350.0, True) == 1.0
+    assert value_at(track, 350.0, False) == 5.0
 
 
 def test_duration_comes_from_the_last_breakpoint() -> None:

@@ -120,6 +120,15 @@ def test_another_waveform_waits_until_the_old_one_has_ramped_down(new: int) -> N
     assert amplitudes[-1] == pytest.approx(3.0 if new != w.OFF else 0.0)
 
 
+def test_another_waveform_starts_at_the_beginning_of_its_period() -> None:
+    changed, fresh = np.zeros(w.W_SIZE), np.zeros(w.W_SIZE)
+    w.ask(changed, w.ROTATING, 6.0, 433.0, 0.0, 10_000)
+    steps(changed, 57)
+    w.ask(changed, w.PULSATING, 5.0, 400.0, 0.2, 10_000)
+    w.ask(fresh, w.PULSATING, 5.0, 400.0, 0.2, 10_000)
+    assert np.array_equal(steps(changed, 50), steps(fresh, 50))
+
+
 COMMANDS = st.lists(
     st.tuples(st.integers(0, 3), st.floats(0.0, 500.0), st.floats(1.0, 5000.0), st.floats(-10.0, 10.0),
               st.integers(0, 60), st.integers(1, 80)),

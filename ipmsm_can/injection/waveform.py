@@ -100,7 +100,6 @@ def step(
         state[W_AXIS] = state[W_ASKED_AXIS]
         target = max(0.0, min(state[W_ASKED_AMPLITUDE], amplitude_limit))
         amplitude = max(target, amplitude - change) if amplitude > target else min(target, amplitude + change)
-    amplitude = min(amplitude, amplitude_limit)
     state[W_AMPLITUDE] = amplitude
     if state[W_WAVEFORM] == OFF or amplitude == 0.0:
         return 0.0, 0.0
