@@ -7,6 +7,7 @@ copy of ipmsm_can.dbc and loads that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from enum import IntEnum
 
@@ -19,6 +20,7 @@ from ipmsm_can.wire.codec import MessageCodec
 from ipmsm_can.wire.dbc import Database, DbcError, default_dbc_path
 from ipmsm_can.wire.e2e import E2EProtection
 
+TWO_PI = 2.0 * math.pi
 NODES = 16
 BLOCK_SAMPLES = 7
 PROTOCOL_VERSION = 1
@@ -233,6 +235,16 @@ class Protocol:
             raise self._error(f"message {kind.message}: {error}") from error
         assert protection is not None
         return protection
+
+    def angle(self, kind: MessageKind, signal: str, radians: ArrayLike) -> NDArray[np.float64]:
+        """The angle as that signal can carry it, 0..2 pi: what would round up to a whole turn becomes 0.
+
+        Encoding saturates; without this, angles within half a step below 2 pi would be a step and a half off.
+        """
+        codec = self.codecs[kind]
+        step = codec.layouts[codec.index[signal]].scale
+        turned = np.asarray(radians, np.float64) % TWO_PI
+        return np.where(turned >= TWO_PI - 0.5 * step, 0.0, turned)
 
     def protection(self, kind: MessageKind, node: int) -> E2EProtection | None:
         """End-to-end parameters of a message of a node, None if it is not protected."""

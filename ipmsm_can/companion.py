@@ -1,0 +1,377 @@
+"""The companion: frames in, frames out, for any number of drives on one bus.
+
+It has no clock, no thread and no socket.  A runner gives it blocks of frames and the time, and sends what
+comes back.  Bad input never raises: it is dropped, counted, and shown in CompanionStatus.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can.config.build import estimator_settings, injection_settings
+from ipmsm_can.config.model import DriveConfig
+from ipmsm_can.estimation import confidence, speed
+from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
+from ipmsm_can.estimation.observers import ges
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.injection import meter
+from ipmsm_can.injection.scheduler import Command, InjectionScheduler
+from ipmsm_can.wire.protocol import (
+    ERROR_FRAME,
+    NODES,
+    REMOTE_FRAME,
+    UNKNOWN,
+    WRONG_LENGTH,
+    CompanionState,
+    MessageKind,
+    ObserverKind,
+    Protocol,
+)
+from ipmsm_can.wire.receive import SampleReceiver
+from ipmsm_can.wire.sequence import SampleRun
+
+STALE_AFTER_NS = 50_000_000
+"""Silence of the drive [ns] after which nothing is claimed any more."""
+OLDEST_ANSWER = 0.02
+"""An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
+STATUS_VERSION = 1
+
+_SAMPLE, _BLOCK, _TIMING, _STATUS = (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK,
+                                     MessageKind.DRIVE_TIMING, MessageKind.DRIVE_STATUS)
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Samples of one node and what was estimated from them.
+
+    injecting (M,): uint8, 1 where the drive said that it injects.
+    """
+
+    node: int
+    run: SampleRun
+    estimate: EstimateBlock
+    injecting: NDArray[np.uint8]
+
+
+@dataclass(slots=True)
+class NodeView:
+    """The latest of one node, for displays: NaN or 0 before the first estimate.
+
+    theta [rad electrical], omega [rad/s electrical], sigma [rad electrical], excitation [V^2 s],
+    hf_current: high-frequency current [A peak]; flags: bits of `confidence`.
+    """
+
+    sample: int = 0
+    sample_rate: float = 0.0
+    theta: float = math.nan
+    omega: float = 0.0
+    sigma: float = math.pi
+    excitation: float = 0.0
+    hf_current: float = 0.0
+    flags: int = 0
+    state: CompanionState = CompanionState.WAITING_FOR_SAMPLES
+    estimates: int = 0
+
+
+class Node:
+    """One drive: its wire, its estimator, its injection."""
+
+    def __init__(self, protocol: Protocol, config: DriveConfig, transmit: bool) -> None:
+        self.config = config
+        self.number = config.wire.node
+        self.view = NodeView()
+        self.receiver = SampleReceiver(protocol, self.number, config.wire.max_gap, config.wire.sample_rate)
+        self.scheduler = InjectionScheduler(injection_settings(config), transmit)
+        self.wrong_length = 0
+        self.injecting = False
+        self.rejected_commands = 0
+        self._protocol = protocol
+        self._motor = config.build_motor()
+        self._settings = estimator_settings(config)
+        self._estimator: Estimator | None = None
+        self._meter = meter.new_state(config.injection.frequency, 1.0)
+        self._last_arrival: int | None = None
+        self._next_status: int | None = None
+        self._next_command: int | None = None
+        self._position_counter = 0
+        self._command_counter = 0
+        status = protocol.codecs[_STATUS].index
+        self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
+
+    # Frames in
+
+    def feed(self, block: FrameBlock, rows: dict[MessageKind, NDArray[np.intp]]) -> list[Tracked]:
+        """Take in this node's frames (row numbers by kind) and estimate from the samples they complete."""
+        none = _NO_ROWS
+        runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none),
+                                  rows.get(_BLOCK, none))
+        before = self.injecting
+        status = rows.get(_STATUS, none)
+        said: NDArray[np.float64] | None = None
+        if status.size:
+            values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
+            said = values[self._waveform_row]
+            self.injecting = bool(said[-1])
+            self.rejected_commands = int(values[self._rejected_row, -1])
+        tracked = []
+        for run in runs:
+            if said is None:
+                injecting = np.full(run.counter.size, before, np.uint8)
+            else:
+                latest = np.searchsorted(block.t_ns[status], run.t_ns, side="right")
+                injecting = np.concatenate([[before], said != 0])[latest].astype(np.uint8)
+            tracked.append(Tracked(self.number, run, self._estimate(run), injecting))
+        return tracked
+
+    def _estimate(self, run: SampleRun) -> EstimateBlock:
+        estimator = self._estimator
+        if estimator is None or estimator.sample_rate != run.sample_rate:
+            estimator = self._estimator = Estimator(self._motor, run.sample_rate, self._settings)
+            frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
+            self._meter = meter.new_state(frequency, run.sample_rate)
+        estimate = estimator.process(run.values, run.gap)
+        view = self.view
+        view.hf_current = meter.meter_block(run.values, self._meter)
+        view.sample = int(run.counter[-1])
+        view.sample_rate = run.sample_rate
+        view.theta = float(estimate.angle[speed.THETA_HAT, -1])
+        view.omega = float(estimate.angle[speed.OMEGA, -1])
+        view.sigma = float(estimate.sigma[-1])
+        view.excitation = float(estimate.excitation[-1])
+        view.flags = int(estimate.flags[-1])
+        self._last_arrival = int(run.t_ns[-1])
+        return estimate
+
+    # Frames out
+
+    def answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
+        """PositionEstimate and ActiveFluxEstimate frames for the samples that are due, newest last."""
+        frames = []
+        for part in tracked:
+            run, rate = part.run, part.run.sample_rate
+            newest = int(run.counter[-1])
+            fresh = (newest - run.counter) & 0xFFFFFFFF <= OLDEST_ANSWER * rate
+            due = np.flatnonzero((run.counter % _every(rate, self.config.estimate.rate) == 0) & fresh)
+            if due.size:
+                frames.append(self._position(part, due))
+            due = np.flatnonzero((run.counter % _every(rate, self.config.estimate.flux_rate) == 0) & fresh)
+            if due.size:
+                frames.append(self._flux(part, due))
+        return frames
+
+    def _position(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
+        e = part.estimate
+        flags = e.flags[due]
+        counters = self._position_counter + np.arange(due.size)
+        self._position_counter += due.size
+        self.view.estimates += due.size
+        return self._protocol.encode(MessageKind.POSITION_ESTIMATE, self.number, {
+            "theta_e": self._protocol.angle(MessageKind.POSITION_ESTIMATE, "theta_e",
+                                            e.angle[speed.THETA_HAT, due]),
+            "omega_e": e.angle[speed.OMEGA, due],
+            "sigma_theta": np.degrees(e.sigma[due]),
+            "sample_counter": part.run.counter[due] & 0x3FF,
+            "valid": flags & confidence.VALID != 0,
+            "locked": flags & confidence.LOCKED != 0,
+            "polarity_known": flags & confidence.POLARITY_KNOWN != 0,
+            "injecting": part.injecting[due],
+        }, counters)
+
+    def _flux(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
+        e = part.estimate
+        phi = np.hypot(e.regression[1, due], e.regression[2, due])
+        innovation = e.flux[ges.INNOVATION, due]
+        return self._protocol.encode(MessageKind.ACTIVE_FLUX_ESTIMATE, self.number, {
+            "x_alpha": e.flux[ges.X_A, due],
+            "x_beta": e.flux[ges.X_B, due],
+            "excitation_level": 10.0 * np.log10(np.maximum(e.excitation[due], 1e-30)),
+            "innovation": np.divide(innovation, phi, out=np.zeros(due.size), where=phi > 0.0),
+        })
+
+    def due(self, now_ns: int, bus_load: float, turnaround: float) -> list[NDArray[np.uint8]]:
+        """InjectionCommand and CompanionStatus frames that are due by the clock."""
+        frames = []
+        command = self._command(now_ns)
+        if command is not None:
+            frames.append(self._protocol.encode(MessageKind.INJECTION_COMMAND, self.number, {
+                "waveform": float(command.waveform), "amplitude": command.amplitude,
+                "frequency": command.frequency,
+                "axis_angle": self._protocol.angle(MessageKind.INJECTION_COMMAND, "axis_angle",
+                                                   command.axis_angle),
+                "time_to_live": 1e3 * command.time_to_live,
+            }, self._command_counter))
+            self._command_counter += 1
+        if self._next_status is None or now_ns >= self._next_status:
+            self._next_status = now_ns + round(1e9 / self.config.estimate.status_rate)
+            frames.append(self._status(now_ns, bus_load, turnaround))
+        return frames
+
+    def _command(self, now_ns: int) -> Command | None:
+        period = self.config.injection.period
+        if self._next_command is None:
+            self._next_command = now_ns
+        if now_ns < self._next_command:
+            return None
+        late = now_ns - self._next_command
+        self._next_command = now_ns + round(period * 1e9) - min(late, round(0.5e9 * period))
+        view = self.view
+        return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
+                                     self._fresh(now_ns))
+
+    def _fresh(self, now_ns: int) -> bool:
+        return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS
+
+    def next_due_ns(self) -> int | None:
+        """When the next sample that gets a PositionEstimate should arrive; None while nothing is known."""
+        view = self.view
+        if self._last_arrival is None or view.sample_rate <= 0.0:
+            return None
+        every = _every(view.sample_rate, self.config.estimate.rate)
+        left = every - view.sample % every
+        return self._last_arrival + round(left * 1e9 / view.sample_rate)
+
+    def update_state(self, now_ns: int) -> CompanionState:
+        """The state as of now, which is also what CompanionStatus says."""
+        view = self.view
+        if self._last_arrival is None:
+            waiting = self.receiver.sequencer.waiting
+            view.state = CompanionState.WAITING_FOR_TIMING if waiting else CompanionState.WAITING_FOR_SAMPLES
+        elif not self._fresh(now_ns):
+            view.state = CompanionState.STALE
+        elif view.flags & confidence.LOCKED:
+            view.state = CompanionState.LOCKED
+        elif view.sigma < math.pi:
+            view.state = CompanionState.TRACKING
+        else:
+            view.state = CompanionState.STARTING
+        return view.state
+
+    @property
+    def bad_frames(self) -> int:
+        """Frames of this node that were dropped: wrong length, wrong CRC, impossible content."""
+        return self.wrong_length + self.receiver.bad_frames + self.receiver.sequencer.count("bad_rate")
+
+    def _status(self, now_ns: int, bus_load: float, turnaround: float) -> NDArray[np.uint8]:
+        return self._protocol.encode(MessageKind.COMPANION_STATUS, self.number, {
+            "state": float(self.update_state(now_ns)),
+            "observer": float(ObserverKind[self._settings.kind.upper()]),
+            "injection_state": float(self.scheduler.state),
+            "injection_reason": float(self.scheduler.reason),
+            "bus_load": 100.0 * bus_load,
+            "lost_samples": self.receiver.sequencer.count("lost") & 0xFFF,
+            "bad_frames": self.bad_frames & 0x3FF,
+            "turnaround": 1e6 * turnaround,
+            "version": float(STATUS_VERSION),
+        })
+
+
+@dataclass(slots=True)
+class FrameCounts:
+    """What came in, by kind of trouble."""
+
+    frames: int = 0
+    unknown: int = 0
+    errors: int = 0
+    remote: int = 0
+    wrong_length: int = 0
+    own: int = 0
+    by_kind: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(MessageKind), np.int64))
+
+
+class Companion:
+    """All nodes of one bus.
+
+    configs: one per drive, node numbers all different.  transmit: whether answers may be sent; without it
+    nothing is ever returned for sending.
+    Raises ValueError when two drives have the same node number or different wire scalings.
+    """
+
+    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, transmit: bool) -> None:
+        numbers = [c.wire.node for c in configs]
+        twice = {n for n in numbers if numbers.count(n) > 1}
+        if twice:
+            raise ValueError(f"node {min(twice)} is given twice; allowed is one drive per node number")
+        self.protocol = protocol
+        self.transmit = transmit
+        self.nodes = {c.wire.node: Node(protocol, c, transmit) for c in configs}
+        self.counts = FrameCounts()
+        self.bus_load = 0.0
+        self.turnaround = 0.0
+
+    def feed(self, block: FrameBlock) -> list[Tracked]:
+        """Take in frames; returns the samples they complete, with their estimates, in order per node."""
+        n = len(block)
+        if not n:
+            return []
+        self.counts.frames += n
+        labels = self.protocol.classify(block.raw)
+        first = int(labels[0])
+        if first >= 0 and (n == 1 or bool((labels == first).all())):
+            # The usual case on a live bus: nothing but samples of one drive since the last look.
+            return self._feed_node(first % NODES, block, {MessageKind(first // NODES): np.arange(n)})
+        self._count_strangers(block, labels)
+        tracked: list[Tracked] = []
+        present = np.unique(labels)
+        for number in sorted({int(p) % NODES for p in present if p >= 0}):
+            rows = {MessageKind(int(p) // NODES): np.flatnonzero(labels == p)
+                    for p in present if p >= 0 and p % NODES == number}
+            tracked += self._feed_node(number, block, rows)
+        return tracked
+
+    def _feed_node(self, number: int, block: FrameBlock,
+                   rows: dict[MessageKind, NDArray[np.intp]]) -> list[Tracked]:
+        for kind, where in rows.items():
+            self.counts.by_kind[kind] += where.size
+        node = self.nodes.get(number)
+        return node.feed(block, rows) if node is not None else []
+
+    def _count_strangers(self, block: FrameBlock, labels: NDArray[np.int16]) -> None:
+        counts = self.counts
+        counts.unknown += int((labels == UNKNOWN).sum())
+        counts.errors += int((labels == ERROR_FRAME).sum())
+        counts.remote += int((labels == REMOTE_FRAME).sum())
+        wrong = np.flatnonzero(labels == WRONG_LENGTH)
+        if wrong.size:
+            counts.wrong_length += wrong.size
+            owners = self.protocol.id_lut[block.can_id[wrong] & 0x7FF] % NODES
+            for number, node in self.nodes.items():
+                node.wrong_length += int((owners == number).sum())
+
+    def next_due_ns(self) -> int | None:
+        """Earliest time at which a sample that is to be answered should arrive; None if nothing is known."""
+        times = [t for t in (node.next_due_ns() for node in self.nodes.values()) if t is not None]
+        return min(times) if times else None
+
+    def process(self, block: FrameBlock, now_ns: int) -> FrameBlock:
+        """Take in frames and give back what is to be sent now.
+
+        now_ns: the runner's clock, on the same axis as block.t_ns.  To be called at least every
+        few milliseconds, with an empty block where nothing came.
+        """
+        return self.respond(self.feed(block), now_ns)
+
+    def respond(self, tracked: Sequence[Tracked], now_ns: int) -> FrameBlock:
+        """The answers to what `feed` gave, and whatever the clock makes due."""
+        frames: list[NDArray[np.uint8]] = []
+        for number, node in self.nodes.items():
+            if tracked:
+                frames += node.answers([t for t in tracked if t.node == number])
+            frames += node.due(now_ns, self.bus_load, self.turnaround)
+        if not frames or not self.transmit:
+            return _NOTHING
+        raw = frames[0] if len(frames) == 1 else np.concatenate(frames)
+        return FrameBlock(raw, np.full(raw.shape[0], now_ns, np.int64))
+
+
+def _every(sample_rate: float, rate: float) -> int:
+    """Every how many samples something with this rate [Hz] falls due."""
+    return max(1, round(sample_rate / rate))
+
+
+_NO_ROWS = np.zeros(0, np.intp)
+_NOTHING = FrameBlock.zeros(0)

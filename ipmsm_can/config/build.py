@@ -1,0 +1,27 @@
+"""From a configuration to the settings of the parts that do the work."""
+
+from __future__ import annotations
+
+from ipmsm_can.config.model import CURRENT_LIMIT_SHARE, DriveConfig
+from ipmsm_can.estimation.estimator import EstimatorSettings
+from ipmsm_can.injection.scheduler import InjectionSettings
+from ipmsm_can.wire.protocol import Waveform
+
+
+def estimator_settings(config: DriveConfig) -> EstimatorSettings:
+    """Settings of the estimator, derived defaults (gamma, epsilon) worked out."""
+    o = config.observer
+    return EstimatorSettings(o.kind, o.alpha, config.gamma, o.initial_flux, config.epsilon, o.excitation_window,
+                             o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
+                             config.estimate.valid_sigma)
+
+
+def injection_settings(config: DriveConfig) -> InjectionSettings:
+    """Settings of the injection scheduler, the current limit worked out."""
+    i = config.injection
+    limit = i.current_limit
+    if limit is None:
+        limit = CURRENT_LIMIT_SHARE * config.build_motor().rated_current
+    return InjectionSettings(i.enabled, Waveform[i.waveform.upper()], i.amplitude, i.frequency, i.speed_on,
+                             i.speed_off, i.excitation_on, i.excitation_off, i.ramp, limit, i.time_to_live,
+                             i.period)

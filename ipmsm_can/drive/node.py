@@ -1,0 +1,162 @@
+"""The simulated drive on the wire: samples out as frames, injection commands in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can.drive.simulation import DriveSamples, DriveSimulation
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.wire.e2e import E2EStatus, SequenceChecker
+from ipmsm_can.wire.protocol import (
+    BLOCK_SAMPLES,
+    NODES,
+    PROTOCOL_VERSION,
+    DriveMode,
+    MessageKind,
+    Protocol,
+    Waveform,
+)
+
+COMMAND_REJECTED = 1 << 5
+"""Bit of DriveStatus.faults that says a command was refused since the last DriveStatus."""
+_AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
+_TEMPERATURE = 40.0
+
+
+@dataclass(frozen=True, slots=True)
+class DriveNodeSettings:
+    """What the drive sends: CAN FD blocks instead of single samples, and how often the rest [Hz, 0 = never]."""
+
+    fd: bool = False
+    timing_rate: float = 50.0
+    status_rate: float = 10.0
+    reference_rate: float = 500.0
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What a stretch of simulation gave: frames to send, in order, and the truth behind them."""
+
+    frames: FrameBlock
+    samples: DriveSamples
+
+
+class DriveNode:
+    """A `DriveSimulation` that speaks the protocol as node `node`.
+
+    A command is obeyed only if its CRC is right, its counter moved on, and it can be executed; every other
+    one is counted in `rejected`, and the one in force runs out by its time to live.
+    """
+
+    def __init__(self, protocol: Protocol, node: int, simulation: DriveSimulation,
+                 settings: DriveNodeSettings) -> None:
+        self.node = node
+        self.simulation = simulation
+        self.settings = settings
+        self.rejected = 0
+        self.waveform = Waveform.OFF
+        self._protocol = protocol
+        self._label = MessageKind.INJECTION_COMMAND * NODES + node
+        self._checker = SequenceChecker(16, 14)
+        index = protocol.codecs[MessageKind.INJECTION_COMMAND].index
+        self._rows = [index[s] for s in ("waveform", "amplitude", "frequency", "axis_angle", "time_to_live")]
+        self._rate = simulation.parameters.sample_rate
+        self._block_counter = 0
+        self._refused = False
+        self._left: NDArray[np.float64] = np.zeros((4, 0))
+
+    def receive(self, block: FrameBlock) -> None:
+        """Take in frames from the bus; only InjectionCommands for this node matter."""
+        rows = np.flatnonzero(self._protocol.classify(block.raw) == self._label)
+        if not rows.size:
+            return
+        values, intact, counters = self._protocol.decode(MessageKind.INJECTION_COMMAND, self.node, block.raw,
+                                                         rows)
+        status = self._checker.update(intact, counters)
+        for column, verdict in zip(values[self._rows].T, status, strict=True):
+            if verdict <= E2EStatus.OK_SOME_LOST and self._obey(column):
+                continue
+            self.rejected += 1
+            self._refused = True
+
+    def _obey(self, command: NDArray[np.float64]) -> bool:
+        waveform, amplitude, frequency, axis_angle, time_to_live = command.tolist()
+        if not all(map(math.isfinite, command)):
+            return False
+        try:
+            self.simulation.command_injection(int(waveform), amplitude, frequency, axis_angle,
+                                              int(1e-3 * time_to_live * self._rate))
+        except ValueError:
+            return False
+        return True
+
+    def step(self, n: int, t0_ns: int = 0) -> Step:
+        """Run n samples; frames carry t0_ns plus the time of their sample."""
+        s = self.simulation.run(n)
+        first = self.simulation.next_sample - n
+        if n:
+            self.waveform = Waveform(int(s.injection_waveform[-1]))
+        parts: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
+        samples = np.array([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+        parts.append(self._blocks(samples, first) if self.settings.fd else self._singles(samples, s.sample))
+        parts += [self._timing(s), self._status(s), self._reference(s)]
+        at = np.concatenate([p[0] for p in parts])
+        order = np.argsort(at, kind="stable")
+        raw = np.concatenate([p[1] for p in parts])[order]
+        t_ns = t0_ns + np.round(at[order] * (1e9 / self._rate)).astype(np.int64)
+        return Step(FrameBlock(raw, t_ns), s)
+
+    def _singles(self, samples: NDArray[np.float64],
+                 counter: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        values = dict(zip(_AXES, samples, strict=True))
+        return counter, self._protocol.encode(MessageKind.DRIVE_SAMPLE, self.node,
+                                              {**values, "sample_counter": counter & 15})
+
+    def _blocks(self, samples: NDArray[np.float64], first: int) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Full blocks of seven; the rest waits for the next call."""
+        first -= self._left.shape[1]
+        together = np.concatenate([self._left, samples], axis=1)
+        m = together.shape[1] // BLOCK_SAMPLES
+        self._left = together[:, m * BLOCK_SAMPLES:]
+        starts = first + BLOCK_SAMPLES * np.arange(m, dtype=np.int64)
+        values = {f"{axis}_{j}": together[r, j:m * BLOCK_SAMPLES:BLOCK_SAMPLES]
+                  for r, axis in enumerate(_AXES) for j in range(BLOCK_SAMPLES)}
+        raw = self._protocol.encode(MessageKind.DRIVE_SAMPLE_BLOCK, self.node,
+                                    {**values, "first_sample": starts & 0xFFFFFFFF,
+                                     "sample_count": np.full(m, BLOCK_SAMPLES)},
+                                    self._block_counter + np.arange(m))
+        self._block_counter += m
+        return starts + BLOCK_SAMPLES - 1, raw
+
+    def _due(self, s: DriveSamples, rate: float) -> NDArray[np.intp]:
+        if rate <= 0.0:
+            return np.zeros(0, np.intp)
+        return np.flatnonzero(s.sample % max(1, round(self._rate / rate)) == 0)
+
+    def _timing(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        sent = s.sample[self._due(s, self.settings.timing_rate)]
+        return sent, self._protocol.encode(MessageKind.DRIVE_TIMING, self.node, {
+            "sample_counter": sent & 0xFFFFFFFF, "sample_rate": np.full(sent.size, self._rate)})
+
+    def _status(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        due = self._due(s, self.settings.status_rate)
+        faults = COMMAND_REJECTED if self._refused else 0
+        if due.size:
+            self._refused = False
+        return s.sample[due], self._protocol.encode(MessageKind.DRIVE_STATUS, self.node, {
+            "mode": np.full(due.size, DriveMode.RUNNING), "active_waveform": s.injection_waveform[due],
+            "encoder_available": np.full(due.size, self.settings.reference_rate > 0.0),
+            "faults": np.full(due.size, faults), "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
+            "temperature": np.full(due.size, _TEMPERATURE),
+            "protocol_version": np.full(due.size, PROTOCOL_VERSION),
+            "rejected_commands": np.full(due.size, self.rejected & 0xFF)})
+
+    def _reference(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        due = self._due(s, self.settings.reference_rate)
+        return s.sample[due], self._protocol.encode(MessageKind.DRIVE_REFERENCE, self.node, {
+            "theta_e": self._protocol.angle(MessageKind.DRIVE_REFERENCE, "theta_e", s.theta_e[due]),
+            "omega_e": s.omega_e[due], "sample_counter": s.sample[due] & 0xFFFFFFFF})

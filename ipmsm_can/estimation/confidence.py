@@ -1,0 +1,193 @@
+"""How far to trust the angle: its 1-sigma, lock, and whether the magnetic polarity is known.
+
+Covariance.  For a correction gain g along Phi the flux error obeys
+x~' = (I - g Phi Phi^T) x~ + g Phi n + T_s dv, so its covariance P follows a Lyapunov recursion, whatever law
+chose the gain.  dv is the error of the reported mean voltage (`voltage_uncertainty`, correlated over
+CORRELATION_TIME); n is the error of the regression: current noise, 2 alpha psi_m L_s i_n, and the same
+voltage error once more through the filters, 2 psi_m |F[dv]|.  The angle's 1-sigma is the standard deviation
+of x_hat across its own direction, divided by |x_hat|.
+
+Lock.  The squared innovation over its predicted variance is averaged over INNOVATION_TIME.  An angle is
+locked while that mean is small and sigma is below the limit asked for; an innovation far outside its
+variance says that P is wrong, and everything learned so far is given up.
+
+Polarity.  At standstill (theta, lambda) and (theta + pi, lambda - 2 psi_m c) give the same voltages and
+currents, whatever is injected: there y = Phi^T x + d is zero.  Only rotation tells the two apart.  So
+polarity counts as known once the observer has contracted by exp(-POLARITY_CONTRACTION) during time in which y
+stood clear of anything that d or the voltage error can make of it; the slower pole of the rotating error
+dynamics, s^2 + k s + w^2 with k = g |Phi|^2 / T_s, is the rate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.motor import Motor
+
+CORRELATION_TIME = 0.01
+"""Time [s] over which a voltage error is taken as constant."""
+INNOVATION_TIME = 0.01
+"""Averaging time [s] of the innovation test."""
+MODEL_ERROR = 0.1
+"""Error of psi_m and the inductances allowed for in the innovation test, relative to psi_m."""
+POLARITY_CONTRACTION = 3.0
+_LOCK_BELOW = 4.0
+_LOST_ABOVE = 9.0
+_SIGMA_HYSTERESIS = 1.5
+_POLARITY_SIGMA = math.radians(45.0)
+
+LOCKED = 1
+POLARITY_KNOWN = 2
+VALID = 4
+
+STATE = np.dtype([
+    ("started", "i8"), ("T_s", "f8"), ("alpha", "f8"), ("psi_m", "f8"), ("ell", "f8"), ("epsilon", "f8"),
+    ("process", "f8"), ("voltage", "f8"), ("white", "f8"), ("sigma_limit", "f8"),
+    ("p_aa", "f8"), ("p_ab", "f8"), ("p_bb", "f8"),
+    ("test", "f8"), ("contraction", "f8"), ("locked", "i8"), ("polarity", "i8"), ("lost", "i8"),
+])
+
+
+def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: float, current_noise: float,
+              sigma_limit: float, sample_rate: float) -> NDArray[np.void]:
+    """Record array (1,) of STATE.
+
+    alpha [1/s]; epsilon [Wb]; voltage_uncertainty [V]; current_noise [A rms]; sigma_limit: largest 1-sigma
+    [rad electrical] at which an angle counts as locked; sample_rate [Hz].
+    """
+    state = np.zeros(1, STATE)
+    st = state[0]
+    st["T_s"] = 1.0 / sample_rate
+    st["alpha"] = alpha
+    st["psi_m"] = motor.psi_m
+    st["ell"] = abs(motor.ell)
+    st["epsilon"] = epsilon
+    st["process"] = 2.0 * voltage_uncertainty**2 * CORRELATION_TIME / sample_rate
+    st["voltage"] = 2.0 * motor.psi_m * voltage_uncertainty
+    st["white"] = (2.0 * alpha * motor.psi_m * motor.L_s * current_noise) ** 2
+    st["sigma_limit"] = sigma_limit
+    return state
+
+
+def forget(state: NDArray[np.void]) -> None:
+    """Give up lock, polarity and covariance: the next sample starts from nothing."""
+    for name in ("started", "test", "contraction", "locked", "polarity"):
+        state[name] = 0
+
+
+def widen(state: NDArray[np.void], flux_variance: float) -> None:
+    """Add flux_variance [Wb^2] in every direction: a gap in the samples went by."""
+    state["p_aa"] += flux_variance
+    state["p_bb"] += flux_variance
+
+
+@kernel
+def confidence_block(regression, flux, speed, state, sigma, flags):  # type: ignore[no-untyped-def]
+    """Judge a block.
+
+    regression: float64 (7, N); flux: float64 (6, N) from an observer; speed: float64 (3, N).
+    sigma: float64 (N,), 1-sigma of theta_hat [rad electrical], at most pi, which means unknown.
+    flags: uint8 (N,), bits LOCKED, POLARITY_KNOWN, VALID.
+    """
+    st = state[0]
+    T_s = st.T_s
+    alpha = st.alpha
+    psi_m = st.psi_m
+    process = st.process
+    correlated = 2.0 * CORRELATION_TIME / T_s
+    smoothing = 1.0 - math.exp(-T_s / INNOVATION_TIME)
+    model2 = (MODEL_ERROR * psi_m) ** 2
+    p_aa = st.p_aa
+    p_ab = st.p_ab
+    p_bb = st.p_bb
+    test = st.test
+    contraction = st.contraction
+    locked = st.locked
+    polarity = st.polarity
+    started = st.started
+    lost = st.lost
+    for k in range(flux.shape[1]):
+        x_a = flux[2, k]
+        x_b = flux[3, k]
+        x2 = x_a * x_a + x_b * x_b
+        if not started:
+            started = 1
+            unknown = (psi_m + math.sqrt(x2)) ** 2
+            p_aa = unknown
+            p_bb = unknown
+            p_ab = 0.0
+        phi_a = regression[1, k]
+        phi_b = regression[2, k]
+        phi2 = phi_a * phi_a + phi_b * phi_b
+        omega = speed[2, k]
+        voltage2 = st.voltage * st.voltage * (alpha * alpha / (alpha * alpha + omega * omega))
+        gain = flux[5, k]
+        # Predict, test the innovation against its own variance, correct.
+        p_aa += process
+        p_bb += process
+        b_a = p_aa * phi_a + p_ab * phi_b
+        b_b = p_ab * phi_a + p_bb * phi_b
+        seen = b_a * phi_a + b_b * phi_b
+        expected = seen + st.white + voltage2 + model2 * phi2
+        innovation = flux[4, k]
+        test += smoothing * (innovation * innovation / max(expected, 1e-30) - test)
+        spread = gain * gain * (seen + st.white + voltage2 * correlated)
+        p_aa += -2.0 * gain * phi_a * b_a + spread * phi_a * phi_a
+        p_bb += -2.0 * gain * phi_b * b_b + spread * phi_b * phi_b
+        p_ab += -gain * (phi_a * b_b + phi_b * b_a) + spread * phi_a * phi_b
+        ceiling = 4.0 * psi_m * psi_m + x2
+        if p_aa > ceiling or p_bb > ceiling:
+            # Nothing is known of this direction; without a ceiling P would grow for ever at standstill.
+            shrink = ceiling / max(p_aa, p_bb)
+            p_aa *= shrink
+            p_ab *= shrink
+            p_bb *= shrink
+        if test > _LOST_ABOVE:
+            p_aa = ceiling
+            p_bb = ceiling
+            p_ab = 0.0
+            test = 1.0
+            contraction = 0.0
+            polarity = 0
+            if locked:
+                lost += 1
+            locked = 0
+        # Angle uncertainty across the direction of x_hat.
+        if x2 > st.epsilon * st.epsilon:
+            across = (x_b * x_b * p_aa - 2.0 * x_a * x_b * p_ab + x_a * x_a * p_bb) / x2
+            s = min(math.sqrt(max(across, 0.0) / x2), math.pi)
+        else:
+            s = math.pi
+        # Polarity: contraction gathered while y cannot be explained by standstill.
+        h = math.sqrt(regression[5, k] ** 2 + regression[6, k] ** 2)
+        if regression[0, k] > 4.0 * st.ell * h + 2.0 * math.sqrt(voltage2):
+            rate = gain * phi2 / T_s
+            if rate > 0.0:
+                contraction += T_s * min(0.5 * rate, omega * omega / rate)
+        if s > _POLARITY_SIGMA:
+            polarity = 0
+        elif contraction > POLARITY_CONTRACTION and test < _LOCK_BELOW:
+            polarity = 1
+        if s >= _POLARITY_SIGMA and contraction > POLARITY_CONTRACTION:
+            contraction = 0.0
+        if locked:
+            if s > _SIGMA_HYSTERESIS * st.sigma_limit:
+                locked = 0
+        elif s < st.sigma_limit and test < _LOCK_BELOW:
+            locked = 1
+        sigma[k] = s
+        valid = locked and polarity and s <= st.sigma_limit
+        flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
+    st.p_aa = p_aa
+    st.p_ab = p_ab
+    st.p_bb = p_bb
+    st.test = test
+    st.contraction = contraction
+    st.locked = locked
+    st.polarity = polarity
+    st.started = started
+    st.lost = lost

@@ -1,0 +1,162 @@
+"""The estimator: samples in, angle, speed, flux, excitation and trust out, block by block."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can.estimation import confidence, excitation, regression, speed
+from ipmsm_can.estimation.observers import ges
+from ipmsm_can.motor import Motor
+
+Floats = NDArray[np.float64]
+
+FORGET_AFTER = 0.5
+"""A gap in the samples longer than this [s] starts everything anew."""
+_SPEED_DOUBT = 0.1
+"""How wrong the extrapolation over a gap may be, relative to the angle turned meanwhile."""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorSettings:
+    """What the estimator needs to know besides the motor; the defaults live in the configuration model.
+
+    kind: name of the observer.  alpha [1/s], gamma [1/(V^2 s)], initial_flux [Wb, Wb], epsilon [Wb];
+    excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
+    valid_sigma: largest 1-sigma of a valid angle [deg electrical].
+    """
+
+    kind: str
+    alpha: float
+    gamma: float
+    initial_flux: tuple[float, float]
+    epsilon: float
+    excitation_window: float
+    speed_bandwidth: float
+    voltage_uncertainty: float
+    current_noise: float
+    valid_sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateBlock:
+    """Result of a block of N samples; all arrays belong to the same samples in the same order.
+
+    regression (7, N): y [V Wb], Phi [V], lambda increment [Wb], H[i] [A/s].
+    flux (6, N): lambda_hat [Wb], x_hat [Wb], innovation [V Wb], correction gain [1/V^2].
+    angle (3, N): theta_hat, smoothed theta [rad electrical, -pi..pi], omega [rad/s electrical].
+    excitation (N,): smallest eigenvalue of the windowed integral of Phi Phi^T [V^2 s].
+    sigma (N,): 1-sigma of theta_hat [rad electrical], pi = unknown.
+    flags (N,): bits LOCKED, POLARITY_KNOWN, VALID of `confidence`.
+    """
+
+    regression: Floats
+    flux: Floats
+    angle: Floats
+    excitation: Floats
+    sigma: Floats
+    flags: NDArray[np.uint8]
+
+    @classmethod
+    def empty(cls, n: int) -> EstimateBlock:
+        """Room for n samples."""
+        return cls(np.empty((regression.ROWS, n)), np.empty((ges.ROWS, n)), np.empty((speed.ROWS, n)),
+                   np.empty(n), np.empty(n), np.empty(n, np.uint8))
+
+
+class Estimator:
+    """Regression, observer, phase-locked loop, excitation and confidence of one drive, with their state.
+
+    Any partition of the same samples into blocks gives the same bits.
+    """
+
+    def __init__(self, motor: Motor, sample_rate: float, settings: EstimatorSettings) -> None:
+        self.motor = motor
+        self.sample_rate = sample_rate
+        self.settings = settings
+        s = settings
+        self._regression_parameters = regression.parameters(motor, s.alpha, sample_rate)
+        self._regression = np.zeros(1, regression.STATE)
+        self._observer_parameters = ges.parameters(motor, s.alpha, s.gamma, s.epsilon, sample_rate)
+        self._observer = np.zeros(1, ges.STATE)
+        self._observer["lambda_a"], self._observer["lambda_b"] = s.initial_flux
+        self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, sample_rate)
+        self._excitation = excitation.new_state(s.excitation_window, sample_rate)
+        self._confidence = confidence.new_state(
+            motor, s.alpha, s.epsilon, s.voltage_uncertainty, s.current_noise,
+            math.radians(s.valid_sigma), sample_rate)
+
+    @property
+    def lost_locks(self) -> int:
+        """How often lock was given up because the innovation did not fit."""
+        return int(self._confidence["lost"][0])
+
+    def process(self, samples: Floats, gap: NDArray[np.int64] | None = None) -> EstimateBlock:
+        """Run a block.
+
+        samples: float64 (4, N), C-contiguous: i_alpha, i_beta [A peak], v_alpha, v_beta [V peak, mean of the
+        interval that ended at the sample].
+        gap: int64 (N,), number of samples missing right before each one, or None for none at all; a gap
+        restarts the filters and carries flux and angle over it with the last speed.
+        """
+        n = samples.shape[1]
+        out = EstimateBlock.empty(n)
+        starts = [] if gap is None else np.flatnonzero(gap).tolist()
+        if not starts:
+            self._segment(samples, out)
+            return out
+        edges = [0, *(k for k in starts if k), n]
+        for begin, end in zip(edges, edges[1:], strict=False):
+            missing = int(gap[begin]) if gap is not None else 0
+            if missing:
+                self._restart(missing, samples[:, begin])
+            part = EstimateBlock.empty(end - begin)
+            self._segment(np.ascontiguousarray(samples[:, begin:end]), part)
+            span = slice(begin, end)
+            out.regression[:, span] = part.regression
+            out.flux[:, span] = part.flux
+            out.angle[:, span] = part.angle
+            out.excitation[span] = part.excitation
+            out.sigma[span] = part.sigma
+            out.flags[span] = part.flags
+        return out
+
+    def _segment(self, samples: Floats, out: EstimateBlock) -> None:
+        regression.regression_block(samples, self._regression_parameters, self._regression, out.regression)
+        ges.ges_block(samples, out.regression, self._observer_parameters, self._observer, out.flux)
+        speed.speed_block(out.flux, self._speed, out.angle)
+        excitation.excitation_block(out.regression, self._excitation, out.excitation)
+        confidence.confidence_block(out.regression, out.flux, out.angle, self._confidence, out.sigma, out.flags)
+
+    def _restart(self, missing: int, first: Floats) -> None:
+        """Start the filters anew before the sample `first` (4,), `missing` samples after the last one."""
+        s = self.settings
+        elapsed = (missing + 1) / self.sample_rate
+        self._regression[:] = np.zeros(1, regression.STATE)
+        old = self._observer[0]
+        fresh = np.zeros(1, ges.STATE)
+        if elapsed > FORGET_AFTER or not self._speed["started"][0]:
+            self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, self.sample_rate)
+            self._excitation = excitation.new_state(s.excitation_window, self.sample_rate)
+            confidence.forget(self._confidence)
+            fresh["lambda_a"], fresh["lambda_b"] = s.initial_flux
+        else:
+            # The rotor went on turning: carry |x_hat| at the angle it must have now.
+            pll = self._speed
+            turned = float(pll["omega"][0]) * elapsed
+            angle = float(pll["theta"][0]) + turned
+            size = self.motor.psi_m
+            held = float(np.hypot(old["x_a"], old["x_b"]))
+            if held > s.epsilon:
+                size = held
+            fresh["lambda_a"] = size * math.cos(angle) + self.motor.L_q * first[0]
+            fresh["lambda_b"] = size * math.sin(angle) + self.motor.L_q * first[1]
+            wrapped = math.remainder(angle, 2.0 * math.pi)
+            pll["theta"] = pll["theta_hat"] = math.remainder(wrapped - turned / (missing + 1), 2.0 * math.pi)
+            doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
+            drift = s.voltage_uncertainty * elapsed
+            confidence.widen(self._confidence, doubt**2 + drift**2)
+        self._observer = fresh

@@ -1,0 +1,1 @@
+"""Position observers, one file each, on the regression of Lemma 1."""

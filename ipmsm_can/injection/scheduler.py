@@ -1,0 +1,154 @@
+"""When to probe, how strong, and why: the state machine behind every InjectionCommand.
+
+Injection starts at low speed or on poor excitation and ends at speed, with hysteresis; the amplitude ramps up
+and down and is cut back in proportion where the measured high-frequency current exceeds its limit.  The
+scheduler has no clock: it is asked once per command period, with the time of the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ipmsm_can.wire.protocol import InjectionReason, InjectionState, Waveform
+
+OFF_REPEATS = 3
+"""How often "off" is said after injection ended, so that one lost frame does not matter."""
+_RECOVERY = 0.1
+"""Share of the way back to full amplitude per second once the current is below its limit again."""
+
+
+@dataclass(frozen=True, slots=True)
+class InjectionSettings:
+    """Settings of the scheduler; the defaults live in the configuration model.
+
+    waveform; amplitude [V peak]; frequency [Hz]; speed_on, speed_off [rad/s electrical]; excitation_on,
+    excitation_off [V^2 s], both 0 = not used; ramp [V/s]; current_limit [A peak]; time_to_live, period [s].
+    """
+
+    enabled: bool
+    waveform: Waveform
+    amplitude: float
+    frequency: float
+    speed_on: float
+    speed_off: float
+    excitation_on: float
+    excitation_off: float
+    ramp: float
+    current_limit: float
+    time_to_live: float
+    period: float
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One InjectionCommand: amplitude [V peak], frequency [Hz], axis_angle [rad electrical], time_to_live [s]."""
+
+    waveform: Waveform
+    amplitude: float
+    frequency: float
+    axis_angle: float
+    time_to_live: float
+
+
+class InjectionScheduler:
+    """State, reason and command of one drive's injection.
+
+    state, reason: as in CompanionStatus; the reason is why the state was last entered.
+    """
+
+    def __init__(self, settings: InjectionSettings, transmit: bool) -> None:
+        self.settings = settings
+        self.amplitude = 0.0
+        self._wanted = False
+        self._share = 1.0
+        self._off_left = 0
+        self._operator: bool | None = None
+        self.state = InjectionState.OFF
+        self.reason = InjectionReason.NONE
+        if not settings.enabled:
+            self._enter(InjectionState.DISABLED, InjectionReason.DISABLED_BY_CONFIGURATION)
+        elif not transmit:
+            self._enter(InjectionState.DISABLED, InjectionReason.TRANSMIT_NOT_ENABLED)
+
+    def _enter(self, state: InjectionState, reason: InjectionReason) -> None:
+        self.state = state
+        self.reason = reason
+
+    def operator(self, wanted: bool | None) -> None:
+        """The operator's word: True on, False off, None back to automatic."""
+        self._operator = wanted
+
+    def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
+               fresh: bool) -> Command | None:
+        """Decide for the next period; returns the command to send, None for silence.
+
+        elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
+        electrical] of the estimate.  current: measured high-frequency current [A peak].  fresh: samples
+        are coming in.
+        """
+        s = self.settings
+        if self.state is InjectionState.DISABLED:
+            return None
+        reason = self._decide(abs(omega), excitation, fresh)
+        target = s.amplitude * self._limit(current, elapsed) if self._wanted else 0.0
+        step = s.ramp * elapsed
+        before = self.amplitude
+        if not fresh:
+            self.amplitude = 0.0
+        elif self.amplitude < target:
+            self.amplitude = min(target, self.amplitude + step)
+        else:
+            self.amplitude = max(target, self.amplitude - step)
+        self._follow(before, target, reason)
+        if self.amplitude > 0.0:
+            self._off_left = OFF_REPEATS
+            return Command(s.waveform, self.amplitude, s.frequency, theta, s.time_to_live)
+        if self._off_left > 0:
+            self._off_left -= 1
+            return Command(Waveform.OFF, 0.0, s.frequency, 0.0, s.time_to_live)
+        return None
+
+    def _decide(self, speed: float, excitation: float, fresh: bool) -> InjectionReason:
+        s = self.settings
+        by_excitation = s.excitation_off > 0.0
+        if not fresh:
+            self._wanted = False
+            return InjectionReason.NO_SAMPLES
+        if self._operator is not None:
+            self._wanted = self._operator
+            return InjectionReason.OPERATOR
+        if not self._wanted:
+            if speed < s.speed_on:
+                self._wanted = True
+                return InjectionReason.LOW_SPEED
+            if by_excitation and excitation < s.excitation_on:
+                self._wanted = True
+                return InjectionReason.POOR_EXCITATION
+        elif speed > s.speed_off and not (by_excitation and excitation < s.excitation_off):
+            self._wanted = False
+            return InjectionReason.SPEED_HIGH_ENOUGH
+        return self.reason
+
+    def _limit(self, current: float, elapsed: float) -> float:
+        """Share of the amplitude that the current limit leaves, 0..1."""
+        limit = self.settings.current_limit
+        if current > limit and self.amplitude > 0.0:
+            # In proportion, from what is injected now: the machine is linear in the small.
+            self._share = min(self._share, self.amplitude / self.settings.amplitude * limit / current)
+        elif current < 0.9 * limit:
+            self._share = min(1.0, self._share + _RECOVERY * elapsed)
+        return self._share
+
+    def _follow(self, before: float, target: float, reason: InjectionReason) -> None:
+        """Name the state that the amplitude is in now."""
+        if not self._wanted:
+            state = InjectionState.RAMP_DOWN if self.amplitude > 0.0 else InjectionState.OFF
+        elif self._share < 1.0 and self.amplitude >= target:
+            state, reason = InjectionState.LIMITED, InjectionReason.CURRENT_LIMIT
+        elif self.amplitude < target:
+            state = InjectionState.RAMP_UP
+        else:
+            state = InjectionState.ON
+        if state is not InjectionState.LIMITED and reason is InjectionReason.CURRENT_LIMIT:
+            reason = InjectionReason.LOW_SPEED
+        self._enter(state, reason)

@@ -1,0 +1,144 @@
+"""From the frames of one drive to its samples: decoding, end-to-end checks, sequencing, and the counts."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.wire.e2e import E2EStatus, SequenceChecker
+from ipmsm_can.wire.protocol import BLOCK_SAMPLES, MessageKind, Protocol
+from ipmsm_can.wire.sequence import DUPLICATES, FULL, NIBBLE, TIMING, Events, SampleRun, SampleSequencer
+
+Rows = NDArray[np.intp]
+_AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
+
+
+@kernel
+def _merge(rows_s, samples, rows_t, timings, rows_b, blocks, first_row, t_ns,  # type: ignore[no-untyped-def]
+           kind, counter, rate, t_out, values):
+    """Events of sample, timing and block frames in order of arrival; returns how many.
+
+    rows_*: where each frame stood in the block.  samples (5, .): i, v, counter.  timings (2, .): counter, rate.
+    blocks (30, .): first_sample, sample_count, 7 x (i, v), whose rows begin at first_row.
+    """
+    n = 0
+    s = 0
+    t = 0
+    b = 0
+    end = t_ns.shape[0]
+    while True:
+        row_s = rows_s[s] if s < rows_s.shape[0] else end
+        row_t = rows_t[t] if t < rows_t.shape[0] else end
+        row_b = rows_b[b] if b < rows_b.shape[0] else end
+        if row_s < row_t and row_s < row_b:
+            kind[n] = NIBBLE
+            counter[n] = int(samples[4, s])
+            rate[n] = 0.0
+            t_out[n] = t_ns[row_s]
+            for r in range(4):
+                values[r, n] = samples[r, s]
+            n += 1
+            s += 1
+        elif row_t < row_b:
+            kind[n] = TIMING
+            counter[n] = int(timings[0, t])
+            rate[n] = timings[1, t]
+            t_out[n] = t_ns[row_t]
+            for r in range(4):
+                values[r, n] = 0.0
+            n += 1
+            t += 1
+        elif row_b < end:
+            for j in range(int(blocks[1, b])):
+                kind[n] = FULL
+                counter[n] = (int(blocks[0, b]) + j) & 0xFFFFFFFF
+                rate[n] = 0.0
+                t_out[n] = t_ns[row_b]
+                for r in range(4):
+                    values[r, n] = blocks[first_row + 4 * j + r, b]
+                n += 1
+            b += 1
+        else:
+            return n
+
+
+class SampleReceiver:
+    """Receives DriveSample, DriveSampleBlock and DriveTiming of one node.
+
+    counts of trouble are in `sequencer` and `bad_frames` (wrong CRC or impossible content).
+    """
+
+    def __init__(self, protocol: Protocol, node: int, max_gap: int, sample_rate: float | None) -> None:
+        self._protocol = protocol
+        self._node = node
+        self.sequencer = SampleSequencer(max_gap, sample_rate)
+        self.bad_frames = 0
+        self._blocks = SequenceChecker(256, 255)
+        codecs = protocol.codecs
+        self._sample = codecs[MessageKind.DRIVE_SAMPLE]
+        self._timing = codecs[MessageKind.DRIVE_TIMING]
+        self._sample_rows = self._order(MessageKind.DRIVE_SAMPLE, (*_AXES, "sample_counter"))
+        self._timing_rows = self._order(MessageKind.DRIVE_TIMING, ("sample_counter", "sample_rate"))
+        self._block_rows = self._order(MessageKind.DRIVE_SAMPLE_BLOCK, (
+            "first_sample", "sample_count",
+            *(f"{axis}_{j}" for j in range(BLOCK_SAMPLES) for axis in _AXES)))
+        self._no_blocks = np.zeros((2 + 4 * BLOCK_SAMPLES, 0))
+
+    def _order(self, kind: MessageKind, names: tuple[str, ...]) -> Rows | None:
+        """Where these signals stand in the DBC's message; None where they are its first ones, in order."""
+        index = self._protocol.codecs[kind].index
+        rows = np.array([index[name] for name in names], np.intp)
+        return None if np.array_equal(rows, np.arange(rows.size)) else rows
+
+    def push(self, block: FrameBlock, samples: Rows, timings: Rows, blocks: Rows) -> list[SampleRun]:
+        """Take in frames of this node; rows of `block` by kind, each in order of arrival."""
+        words = block.words
+        s = self._sample.decode_rows(words, samples)
+        if self._sample_rows is not None:
+            s = s[self._sample_rows]
+        samples, s = self._finite(samples, s)
+        if not timings.size and not blocks.size:
+            events = Events(np.zeros(samples.size, np.int64), s[4].astype(np.int64), np.zeros(samples.size),
+                            block.t_ns[samples], s[:4])
+            return self.sequencer.push(events)
+        t = self._timing.decode_rows(words, timings)
+        if self._timing_rows is not None:
+            t = t[self._timing_rows]
+        timings, t = self._finite(timings, t)
+        blocks, b = self._intact_blocks(block, blocks)
+        room = samples.size + timings.size + BLOCK_SAMPLES * blocks.size
+        kind = np.empty(room, np.int64)
+        counter = np.empty(room, np.int64)
+        rate = np.empty(room)
+        t_ns = np.empty(room, np.int64)
+        values = np.empty((4, room))
+        n = _merge(samples, s, timings, t, blocks, b, 2, block.t_ns, kind, counter, rate, t_ns, values)
+        return self.sequencer.push(Events(kind[:n], counter[:n], rate[:n], t_ns[:n],
+                                          values if n == room else np.ascontiguousarray(values[:, :n])))
+
+    def _finite(self, rows: Rows, values: NDArray[np.float64]) -> tuple[Rows, NDArray[np.float64]]:
+        """Without the frames that hold a NaN or an infinity (possible in somebody's float signals)."""
+        good = np.isfinite(values).all(axis=0)
+        if good.all():
+            return rows, values
+        self.bad_frames += int(good.size - good.sum())
+        return rows[good], np.ascontiguousarray(values[:, good])
+
+    def _intact_blocks(self, block: FrameBlock, rows: Rows) -> tuple[Rows, NDArray[np.float64]]:
+        if not rows.size:
+            return rows, self._no_blocks
+        b, intact, counters = self._protocol.decode(MessageKind.DRIVE_SAMPLE_BLOCK, self._node, block.raw, rows)
+        if self._block_rows is not None:
+            b = b[self._block_rows]
+        status = self._blocks.update(intact, counters)
+        repeated = status == E2EStatus.REPEATED
+        self.sequencer.counts[DUPLICATES] += int(np.nansum(b[1][repeated]))
+        self.bad_frames -= int(repeated.sum())
+        good = status <= E2EStatus.OK_SOME_LOST
+        good &= np.isfinite(b).all(axis=0) & (b[1] >= 1) & (b[1] <= BLOCK_SAMPLES)
+        if good.all():
+            return rows, np.ascontiguousarray(b)
+        self.bad_frames += int(good.size - good.sum())
+        return rows[good], np.ascontiguousarray(b[:, good])

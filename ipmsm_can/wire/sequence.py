@@ -1,0 +1,344 @@
+"""From sample frames in order of arrival to samples in order of time.
+
+Time comes from the drive's sample counter.  A classical DriveSample carries its low four bits, so a longer
+silence leaves open how many whole wraps went by: the arrival time gives the first guess, and the 32-bit
+counter of the next DriveTiming settles it.  A DriveSampleBlock carries the whole counter.
+
+What can happen, and what is done:
+
+    lost, at most max_gap       filled by straight lines between the neighbours, marked as filled
+    lost, more                  `gap` tells the estimator how many are missing: its filters restart
+    duplicate                   dropped
+    reordered (late)            dropped: its place was filled already
+    wraps guessed wrong         put right by DriveTiming, filters restart          (resync)
+    drive restarted             counter jumps back or far ahead: everything anew   (restart)
+
+Everything is counted.  Samples that arrive before the sample rate is known wait (see `SampleSequencer`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+
+NIBBLE, TIMING, FULL = range(3)
+"""Kinds of event: sample with a 4-bit counter, DriveTiming, sample with a 32-bit counter."""
+
+RATE_MIN, RATE_MAX = 100.0, 100_000.0
+"""Sample rates [Hz] that are believed."""
+RESTARTED = 1 << 40
+"""Value of `gap` at the first sample after the drive restarted: nothing before it counts."""
+LONGEST_SILENCE = 60.0
+"""A counter further ahead than this [s] is a restarted drive, not a gap."""
+PENDING_MAX = 1 << 17
+"""Events kept while the sample rate is unknown."""
+
+STATE = np.dtype([
+    ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
+    ("rate", "f8"), ("synced", "i8"), ("restarted", "i8"), ("broken", "i8"), ("seen", "u8"),
+    ("values", "f8", (4,)),
+])
+
+RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
+COUNTERS = ("received", "filled", "lost", "duplicates", "reordered", "gaps", "resyncs", "restarts",
+            "bad_rate", "overflow")
+
+_DONE, _RATE_CHANGED = range(2)
+
+_WRAP = 1 << 32
+
+
+@dataclass(frozen=True, slots=True)
+class Events:
+    """Sample and timing frames of one drive in order of arrival, N events.
+
+    kind (N,) int64: NIBBLE, TIMING or FULL.  counter (N,) int64: 4 or 32 bits.  rate (N,) float64 [Hz], for
+    TIMING.  t_ns (N,) int64 arrival time [ns].  values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
+    """
+
+    kind: NDArray[np.int64]
+    counter: NDArray[np.int64]
+    rate: NDArray[np.float64]
+    t_ns: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return self.kind.shape[0]
+
+    def after(self, begin: int) -> Events:
+        """The events from `begin` on."""
+        return Events(self.kind[begin:], self.counter[begin:], self.rate[begin:], self.t_ns[begin:],
+                      np.ascontiguousarray(self.values[:, begin:]))
+
+    @classmethod
+    def joined(cls, first: Events, second: Events) -> Events:
+        """Both, one after the other."""
+        return cls(np.concatenate([first.kind, second.kind]), np.concatenate([first.counter, second.counter]),
+                   np.concatenate([first.rate, second.rate]), np.concatenate([first.t_ns, second.t_ns]),
+                   np.concatenate([first.values, second.values], axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRun:
+    """Samples in order of time, M of them, all at one sample rate.
+
+    sample_rate [Hz].  counter (M,) int64: the drive's 32-bit counter.  values (4, M), C-contiguous.
+    filled (M,) uint8: 1 where interpolated.  gap (M,) int64: samples missing right before this one (0 where
+    none, RESTARTED after a restart of the drive).  t_ns (M,) int64: arrival of the frame (filled: of the
+    frame that closed the gap).
+    """
+
+    sample_rate: float
+    counter: NDArray[np.int64]
+    values: NDArray[np.float64]
+    filled: NDArray[np.uint8]
+    gap: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+
+
+@kernel
+def _steps_since_last(nibble, t_ns, st):  # type: ignore[no-untyped-def]
+    """How many samples lie between the last one and this 4-bit counter; 0 duplicate, negative late."""
+    delta = (nibble - st.last) & 15
+    if st.rate > 0.0:
+        expected = (t_ns - st.last_t) * 1e-9 * st.rate
+        expected = min(max(expected, -1e9), 1e9)
+        steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
+    else:
+        steps = delta if delta <= 8 else delta - 16
+    if steps < -15:
+        steps = delta - 16 if delta else 0
+    if steps > 0 and st.has_floor and st.last + steps < st.floor:
+        # DriveTiming said that `floor` had been sent before this frame: whole wraps are missing.
+        behind = st.floor - st.last - steps
+        steps += 16 * ((behind + 15) // 16)
+    elif steps <= 0 and st.has_floor and st.floor - st.last >= 16:
+        behind = st.floor - st.last - delta
+        steps = delta + 16 * ((behind + 15) // 16)
+    return steps
+
+
+@kernel
+def _timing(counter, rate, st, counts):  # type: ignore[no-untyped-def]
+    """Take in a DriveTiming; True where the sample rate changed."""
+    changed = rate != st.rate
+    st.rate = rate
+    synced = st.synced
+    st.synced = 1
+    if not st.has_last:
+        st.has_floor = 1
+        st.floor = counter
+        return changed
+    if not synced and not changed:
+        # Counters were relative until now; the samples themselves are unbroken.
+        st.last = counter - ((counter - st.last) & 15)
+        st.has_floor = 1
+        st.floor = counter
+        return changed
+    ahead = (counter - st.last) & (_WRAP - 1)
+    if ahead >= _WRAP // 2:
+        ahead -= _WRAP
+    if changed or ahead > LONGEST_SILENCE * rate or ahead < -2.0 * rate - 16.0:
+        counts[RESTARTS] += 1
+        st.has_last = 0
+        st.restarted = 1
+        st.has_floor = 1
+        st.floor = counter
+    elif ahead < 0 and (ahead & 15) == 0:
+        counts[RESYNCS] += 1
+        counts[LOST] += ahead
+        st.last += ahead
+        st.broken = 1
+        st.has_floor = 1
+        st.floor = st.last
+    elif ahead >= 0:
+        st.has_floor = 1
+        st.floor = st.last + ahead
+    return changed
+
+
+@kernel
+def sequence(begin, kind, counter, rate, t_ns, values, max_gap, st_array, counts,  # type: ignore[no-untyped-def]
+             out_counter, out_values, out_filled, out_gap, out_t):
+    """Sequence events from `begin` on; stops after a change of sample rate.
+
+    Returns (number of samples put out, next event, _DONE or _RATE_CHANGED).  The outputs need room for
+    (max_gap + 1) samples per event.
+    """
+    st = st_array[0]
+    m = 0
+    k = begin
+    n = kind.shape[0]
+    while k < n:
+        if kind[k] == TIMING:
+            if not (rate[k] >= RATE_MIN and rate[k] <= RATE_MAX):
+                counts[BAD_RATE] += 1
+            elif _timing(counter[k], rate[k], st, counts):
+                return m, k + 1, _RATE_CHANGED
+            k += 1
+            continue
+        if st.has_last:
+            if kind[k] == NIBBLE:
+                steps = _steps_since_last(counter[k], t_ns[k], st)
+            else:
+                steps = (counter[k] - st.last) & (_WRAP - 1)
+                if steps >= _WRAP // 2:
+                    steps -= _WRAP
+                far = LONGEST_SILENCE * st.rate if st.rate > 0.0 else 1e6
+                if steps > far or steps < -1024:
+                    counts[RESTARTS] += 1
+                    st.restarted = 1
+                    st.has_last = 0
+            if st.has_last and steps <= 0:
+                if steps > -64 and (st.seen >> np.uint64(-steps)) & np.uint64(1):
+                    counts[DUPLICATES] += 1
+                else:
+                    counts[REORDERED] += 1
+                k += 1
+                continue
+        missing = 0
+        if st.has_last:
+            missing = steps - 1
+            st.last += steps
+            st.seen = (st.seen << np.uint64(steps)) | np.uint64(1) if steps < 64 else np.uint64(1)
+            counts[LOST] += missing
+        else:
+            st.seen = np.uint64(1)
+            if kind[k] == FULL:
+                st.last = counter[k]
+                st.synced = 1
+            else:
+                floor = st.floor if st.has_floor else 0
+                st.last = floor + ((counter[k] - floor) & 15)
+        gap = 0
+        if st.restarted or not st.has_last:
+            gap = RESTARTED if st.restarted else 0
+        elif st.broken or missing > max_gap:
+            gap = max(missing, 1)
+            counts[GAPS] += 1
+        else:
+            for j in range(1, missing + 1):
+                weight = j / (missing + 1)
+                for r in range(4):
+                    out_values[r, m] = st.values[r] + weight * (values[r, k] - st.values[r])
+                out_counter[m] = (st.last - missing - 1 + j) & (_WRAP - 1)
+                out_filled[m] = 1
+                out_gap[m] = 0
+                out_t[m] = t_ns[k]
+                m += 1
+            counts[FILLED] += missing
+        for r in range(4):
+            out_values[r, m] = values[r, k]
+            st.values[r] = values[r, k]
+        out_counter[m] = st.last & (_WRAP - 1)
+        out_filled[m] = 0
+        out_gap[m] = gap
+        out_t[m] = t_ns[k]
+        m += 1
+        counts[RECEIVED] += 1
+        st.has_last = 1
+        st.restarted = 0
+        st.broken = 0
+        st.last_t = t_ns[k]
+        k += 1
+    return m, n, _DONE
+
+
+class SampleSequencer:
+    """Sequencing of one drive's samples, with its state and counters.
+
+    max_gap: longest loss, in samples, that is filled by interpolation, 0..64.
+    sample_rate: [Hz], used where the drive sends no DriveTiming; None: samples wait for the first one, at most
+    PENDING_MAX of them, and then get the right 32-bit counters in hindsight.
+    """
+
+    def __init__(self, max_gap: int, sample_rate: float | None = None) -> None:
+        self.max_gap = max_gap
+        self.counts = np.zeros(len(COUNTERS), np.int64)
+        self._fallback_rate = sample_rate
+        self._state = np.zeros(1, STATE)
+        self._pending: Events | None = None
+
+    def count(self, name: str) -> int:
+        """One of COUNTERS."""
+        return int(self.counts[COUNTERS.index(name)])
+
+    @property
+    def sample_rate(self) -> float:
+        """Sample rate in force [Hz]; 0 while unknown."""
+        return float(self._state["rate"][0])
+
+    @property
+    def waiting(self) -> bool:
+        """True while samples have come but no sample rate."""
+        return self._pending is not None
+
+    def push(self, events: Events) -> list[SampleRun]:
+        """Take in events; returns the samples they complete, in runs of one sample rate each."""
+        if not len(events):
+            return []
+        if self.sample_rate == 0.0:
+            if self._pending is not None:
+                events = Events.joined(self._pending, events)
+            believed = (events.rate >= RATE_MIN) & (events.rate <= RATE_MAX)
+            timings = np.flatnonzero((events.kind == TIMING) & believed)
+            if timings.size:
+                self._pending = None
+                self._synchronise(events, int(timings[0]))
+            elif self._fallback_rate is not None:
+                self._pending = None
+                self._state["rate"] = self._fallback_rate
+            else:
+                over = len(events) - PENDING_MAX
+                if over > 0:
+                    self.counts[OVERFLOW] += over
+                    events = events.after(over)
+                self._pending = events
+                return []
+        return self._run(events)
+
+    def _synchronise(self, events: Events, timing: int) -> None:
+        """Give the samples before the first DriveTiming the counters they must have had."""
+        self._state["rate"] = events.rate[timing]
+        kinds = events.kind[:timing]
+        nibbles = np.flatnonzero(kinds == NIBBLE)
+        if not nibbles.size or (kinds == FULL).any():
+            return
+        before = Events(events.kind[:timing], events.counter[:timing], events.rate[:timing],
+                        events.t_ns[:timing], np.ascontiguousarray(events.values[:, :timing]))
+        trial = SampleSequencer(0)
+        trial._state["rate"] = self._state["rate"]
+        runs = trial._run(before)
+        if not runs:
+            return
+        first = int(runs[0].counter[0])
+        last = int(runs[-1].counter[-1])
+        sent = int(events.counter[timing])
+        settled = sent - ((sent - last) & 15)
+        self._state["has_floor"] = 1
+        self._state["floor"] = (settled - last + first) % _WRAP
+
+    def _run(self, events: Events) -> list[SampleRun]:
+        runs: list[SampleRun] = []
+        begin = 0
+        while begin < len(events):
+            room = (len(events) - begin) * (self.max_gap + 1)
+            rate = self.sample_rate
+            counter = np.empty(room, np.int64)
+            values = np.empty((4, room))
+            filled = np.empty(room, np.uint8)
+            gap = np.empty(room, np.int64)
+            t_ns = np.empty(room, np.int64)
+            m, begin, why = sequence(begin, events.kind, events.counter, events.rate, events.t_ns,
+                                     events.values, self.max_gap, self._state, self.counts,
+                                     counter, values, filled, gap, t_ns)
+            if m:
+                runs.append(SampleRun(rate, counter[:m], np.ascontiguousarray(values[:, :m]), filled[:m],
+                                      gap[:m], t_ns[:m]))
+            if why == _DONE:
+                break
+        return runs

@@ -1,0 +1,284 @@
+"""Sequencing against a simulated sender that knows what it sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ipmsm_can.wire.sequence import FULL, NIBBLE, PENDING_MAX, RESTARTED, TIMING, Events, SampleRun, SampleSequencer
+
+RATE = 5000.0
+PERIOD_NS = int(1e9 / RATE)
+
+
+def value(counter: int) -> list[float]:
+    """A sample that says who it is; straight lines survive interpolation exactly enough."""
+    return [0.01 * counter, -0.02 * counter, 1.0 * counter, 5.0]
+
+
+@dataclass
+class Sender:
+    """Makes events; `first` is the 32-bit counter of sample 0 of the list index."""
+
+    rows: list[tuple[int, int, float, int, list[float]]] = field(default_factory=list)
+
+    def sample(self, counter: int, t_ns: int | None = None, full: bool = False) -> None:
+        t = counter * PERIOD_NS if t_ns is None else t_ns
+        self.rows.append((FULL if full else NIBBLE, counter if full else counter & 15, 0.0, t, value(counter)))
+
+    def timing(self, counter: int, rate: float = RATE, t_ns: int | None = None) -> None:
+        t = counter * PERIOD_NS if t_ns is None else t_ns
+        self.rows.append((TIMING, counter & 0xFFFFFFFF, rate, t, [0.0] * 4))
+
+    def events(self) -> Events:
+        kind, counter, rate, t, values = (list(c) for c in zip(*self.rows, strict=True))
+        self.rows = []
+        return Events(np.array(kind, np.int64), np.array(counter, np.int64), np.array(rate, float),
+                      np.array(t, np.int64), np.ascontiguousarray(np.array(values, float).T))
+
+
+def one(runs: list[SampleRun]) -> SampleRun:
+    assert len(runs) == 1
+    return runs[0]
+
+
+def synced(first: int = 1000, max_gap: int = 8) -> tuple[SampleSequencer, Sender]:
+    """A sequencer that has seen a DriveTiming and the sample `first`."""
+    sequencer, sender = SampleSequencer(max_gap), Sender()
+    sender.timing(first - 1)
+    sender.sample(first)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [first]
+    return sequencer, sender
+
+
+def test_unbroken() -> None:
+    sequencer, sender = synced()
+    for k in range(1001, 1101):
+        sender.sample(k)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == list(range(1001, 1101))
+    assert not run.filled.any()
+    assert not run.gap.any()
+    assert run.sample_rate == RATE
+    assert sequencer.count("lost") == 0
+
+
+def test_short_loss_is_filled_by_straight_lines() -> None:
+    sequencer, sender = synced()
+    for k in (1001, 1002, 1007, 1008):
+        sender.sample(k)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == list(range(1001, 1009))
+    assert run.filled.tolist() == [0, 0, 1, 1, 1, 1, 0, 0]
+    expected = np.array([value(k) for k in range(1001, 1009)]).T
+    assert np.allclose(run.values, expected, rtol=1e-12)
+    assert (sequencer.count("lost"), sequencer.count("filled")) == (4, 4)
+
+
+def test_long_loss_leaves_a_gap_whose_wraps_the_arrival_time_tells() -> None:
+    for missing in (9, 15, 16, 17, 100, 1000):
+        sequencer, sender = synced()
+        sender.sample(1001)
+        sender.sample(1002 + missing)
+        sender.sample(1003 + missing)
+        run = one(sequencer.push(sender.events()))
+        assert run.counter.tolist() == [1001, 1002 + missing, 1003 + missing], missing
+        assert run.gap.tolist() == [0, missing, 0]
+        assert sequencer.count("lost") == missing
+        assert sequencer.count("filled") == 0
+
+
+def test_timing_settles_wraps_that_the_arrival_time_hides() -> None:
+    """All frames carry the same time stamp: 32 lost samples look like none until DriveTiming."""
+    sequencer, sender = synced()
+    frozen = 1000 * PERIOD_NS
+    sender.timing(1033, t_ns=frozen)
+    sender.sample(1034, t_ns=frozen)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [1034]
+    assert run.gap.tolist() == [33]
+
+
+def test_timing_corrects_a_gap_that_was_guessed_too_long() -> None:
+    """A stalled reader stamps late: the guess is whole wraps too far; DriveTiming puts it right."""
+    sequencer, sender = synced()
+    sender.sample(1001, t_ns=1033 * PERIOD_NS)
+    assert one(sequencer.push(sender.events())).counter.tolist() == [1033]
+    sender.timing(1001, t_ns=1033 * PERIOD_NS)
+    sender.sample(1002, t_ns=1034 * PERIOD_NS)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [1002]
+    assert run.gap[0] > 0
+    assert sequencer.count("resyncs") == 1
+    assert sequencer.count("lost") == 0
+
+
+def test_duplicates_and_late_frames_are_dropped_and_told_apart() -> None:
+    sequencer, sender = synced()
+    sender.sample(1001)
+    sender.sample(1001, t_ns=1001 * PERIOD_NS + 10)
+    sender.sample(1003)
+    sender.sample(1002, t_ns=1003 * PERIOD_NS + 10)
+    sender.sample(1001, t_ns=1003 * PERIOD_NS + 20)
+    sender.sample(1004)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [1001, 1002, 1003, 1004]
+    assert run.filled.tolist() == [0, 1, 0, 0]
+    assert sequencer.count("duplicates") == 2
+    assert sequencer.count("reordered") == 1
+
+
+def test_samples_before_the_first_timing_get_their_counters_in_hindsight() -> None:
+    sequencer, sender = SampleSequencer(8), Sender()
+    for k in range(70_003, 70_050):
+        sender.sample(k)
+    assert sequencer.push(sender.events()) == []
+    assert sequencer.waiting
+    sender.sample(70_050)
+    sender.timing(70_051)
+    sender.sample(70_052)
+    runs = sequencer.push(sender.events())
+    assert np.concatenate([r.counter for r in runs]).tolist() == list(range(70_003, 70_053))
+    assert sequencer.count("lost") == 1
+    assert not sequencer.waiting
+
+
+def test_waiting_is_bounded() -> None:
+    sequencer = SampleSequencer(0)
+    n = PENDING_MAX + 500
+    counter = np.arange(n, dtype=np.int64)
+    zeros = np.zeros(n)
+    assert sequencer.push(Events(np.zeros(n, np.int64), counter & 15, zeros, counter * PERIOD_NS,
+                                 np.zeros((4, n)))) == []
+    assert sequencer.count("overflow") == 500
+    sender = Sender()
+    sender.timing(n - 1)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter[0] == 500
+    assert run.counter[-1] == n - 1
+
+
+def test_configured_rate_serves_until_timing_comes() -> None:
+    sequencer, sender = SampleSequencer(8, sample_rate=RATE), Sender()
+    for k in range(2005, 2010):
+        sender.sample(k)
+    run = one(sequencer.push(sender.events()))
+    assert (run.counter & 15).tolist() == [k & 15 for k in range(2005, 2010)]
+    sender.timing(2009)
+    sender.sample(2010)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [2010]
+    assert not run.gap.any()
+    assert sequencer.count("restarts") == 0
+
+
+def test_restarted_drive() -> None:
+    sequencer, sender = synced(1_000_000)
+    sender.timing(3, t_ns=1_000_100 * PERIOD_NS)
+    sender.sample(4, t_ns=1_000_101 * PERIOD_NS)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [4]
+    assert run.gap.tolist() == [RESTARTED]
+    assert sequencer.count("restarts") == 1
+
+
+def test_change_of_rate_ends_a_run() -> None:
+    sequencer, sender = synced()
+    sender.sample(1001)
+    sender.timing(1001, rate=10_000.0)
+    sender.sample(1002)
+    runs = sequencer.push(sender.events())
+    assert [r.sample_rate for r in runs] == [5000.0, 10_000.0]
+    assert runs[1].gap.tolist() == [RESTARTED]
+
+
+def test_absurd_rates_are_refused() -> None:
+    sequencer, sender = synced()
+    for rate in (0.0, 50.0, 4e6, float("nan"), float("inf")):
+        sender.timing(1000, rate=rate)
+    sender.sample(1001)
+    run = one(sequencer.push(sender.events()))
+    assert run.sample_rate == RATE
+    assert sequencer.count("bad_rate") == 5
+
+
+def test_the_32_bit_counter_wraps() -> None:
+    for full in (False, True):
+        sequencer, sender = synced(0xFFFF_FFF0)
+        for k in range(0xFFFF_FFF1, 0x1_0000_0010):
+            sender.sample(k & 0xFFFF_FFFF if full else k, t_ns=k * PERIOD_NS, full=full)
+        sender.timing(0x1_0000_000F)
+        sender.sample(0x1_0000_0010 & 0xFFFF_FFFF if full else 0x1_0000_0010, t_ns=0x1_0000_0010 * PERIOD_NS,
+                      full=full)
+        run = one(sequencer.push(sender.events()))
+        assert run.counter.tolist() == [k & 0xFFFF_FFFF for k in range(0xFFFF_FFF1, 0x1_0000_0011)]
+        assert sequencer.count("restarts") == 0
+        assert sequencer.count("resyncs") == 0
+
+
+def test_whole_counters_need_no_guess() -> None:
+    sequencer, sender = synced()
+    frozen = 1000 * PERIOD_NS
+    sender.sample(1001, frozen, full=True)
+    sender.sample(1500, frozen, full=True)
+    sender.sample(1500, frozen, full=True)
+    sender.sample(1001, frozen, full=True)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.tolist() == [1001, 1500]
+    assert run.gap.tolist() == [0, 498]
+    assert sequencer.count("duplicates") + sequencer.count("reordered") == 2
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 40), min_size=1, max_size=60),
+       st.lists(st.integers(1, 30), min_size=1, max_size=20), st.integers(0, 20))
+def test_losses_of_any_length_keep_the_counter_true(first: int, steps: list[int], cuts: list[int],
+                                                    max_gap: int) -> None:
+    """Random losses, arrival jitter up to a few samples, random blocks: counters true, nothing invented."""
+    rng = np.random.default_rng(len(steps))
+    sender = Sender()
+    sender.timing(first - 1, t_ns=0)
+    absolute = first
+    sent = []
+    for step in steps:
+        sent.append(absolute)
+        jitter = int(rng.integers(0, 3 * PERIOD_NS))
+        sender.sample(absolute, t_ns=(absolute - first) * PERIOD_NS + jitter)
+        absolute += step
+    events = sender.events()
+    sequencer = SampleSequencer(max_gap)
+    runs: list[SampleRun] = []
+    begin = 0
+    while begin < len(events):
+        size = cuts[begin % len(cuts)]
+        rest = events.after(begin)
+        runs += sequencer.push(Events(rest.kind[:size], rest.counter[:size], rest.rate[:size],
+                                      rest.t_ns[:size], np.ascontiguousarray(rest.values[:, :size])))
+        begin += size
+    counter = np.concatenate([r.counter for r in runs])
+    filled = np.concatenate([r.filled for r in runs]).astype(bool)
+    assert counter[~filled].tolist() == [c & 0xFFFFFFFF for c in sent]
+    assert sequencer.count("lost") == sum(steps[:-1]) - len(steps) + 1
+    expected = sum(s - 1 for s in steps[:-1] if s - 1 <= max_gap)
+    assert int(filled.sum()) == expected == sequencer.count("filled")
+    assert np.isfinite(np.concatenate([r.values for r in runs], axis=1)).all()
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 2**32 - 1), st.floats(0, 4.2e6),
+                          st.integers(-(2**62), 2**62)), max_size=200))
+def test_nonsense_never_raises(rows: list[tuple[int, int, float, int]]) -> None:
+    n = len(rows)
+    kind = np.array([r[0] for r in rows], np.int64)
+    counter = np.array([r[1] for r in rows], np.int64)
+    counter[kind == NIBBLE] &= 15
+    events = Events(kind, counter, np.array([r[2] for r in rows], float),
+                    np.array([r[3] for r in rows], np.int64), np.ones((4, n)))
+    sequencer = SampleSequencer(8)
+    for run in sequencer.push(events):
+        assert (run.counter >= 0).all()
+        assert (run.counter < 2**32).all()
+        assert (run.gap >= 0).all()
+        assert np.isfinite(run.values).all()
