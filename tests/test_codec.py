@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from typing import Any
+from typing import Any, Literal
 
 import cantools.database
 import numpy as np
@@ -159,6 +159,30 @@ def test_motorola_across_the_word_by_hand() -> None:
     raw = codec.encode({"x": 0b10_00000001_11111111_01})
     assert raw[0, 8:20].tolist() == [0] * 7 + [0b10, 1, 0xFF, 0b01000000, 0]
     assert codec.decode(raw.view(np.uint64))[0, 0] == 0b10_00000001_11111111_01
+
+
+@pytest.mark.parametrize("motorola", [False, True])
+def test_every_place_in_two_words(motorola: bool) -> None:
+    order: Literal["big", "little"] = "big" if motorola else "little"
+    pattern = np.random.default_rng(9).integers(0, 256, 16, np.uint8)
+    block = frames([bytes(pattern), bytes(~pattern)])  # so that every bit is seen as 0 and as 1
+    wholes = [int.from_bytes(p, order) for p in (bytes(pattern), bytes(~pattern))]
+    for length in (1, 2, 7, 8, 9, 16, 31, 33, 63, 64):
+        for first in range(128 - length + 1):
+            down = 128 - first - length if motorola else first  # how far the value stands above the last bit
+            expected = [(whole >> down) & ((1 << length) - 1) for whole in wholes]
+            start = first ^ 7 if motorola else first
+            codec = MessageCodec("M", 1, 16, [SignalLayout("x", start, length, motorola=motorola)])
+            assert [int(x) % 2**64 for x in codec.decode_raw(block.words)[0]] == expected, (first, length)
+            values = [x >> max(length - 53, 0) << max(length - 53, 0) for x in expected]  # exact as doubles
+            for row, value in zip(codec.encode({"x": np.array(values, float)}), values, strict=True):
+                assert int.from_bytes(bytes(row[8:24]), order) == value << down, (first, length)
+
+
+def test_unsigned_64_bits_above_the_signed_half() -> None:
+    codec = coder(64)
+    for value in (2**63, 2**63 + 2**20, 2**64 - 2**12):
+        assert encoded_raw(codec, float(value)) % 2**64 == value
 
 
 def coder(length: int, kind: Any = "unsigned", **more: Any) -> MessageCodec:
