@@ -13,14 +13,16 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can._jit import kernel
 from ipmsm_can.config.build import estimator_settings, injection_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.estimation.observers import ges
-from ipmsm_can.frames import FrameBlock
+from ipmsm_can.frames import CAN_SFF_MASK, FrameBlock
 from ipmsm_can.injection import meter
 from ipmsm_can.injection.scheduler import Command, InjectionScheduler
+from ipmsm_can.wire.answers import POSITION_SIGNALS, due_rows, position_values
 from ipmsm_can.wire.protocol import (
     ERROR_FRAME,
     NODES,
@@ -102,6 +104,10 @@ class Node:
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index
         self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
+        position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
+        self._position_width = len(position.signals)
+        self._position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
+        self._position_step = position.layouts[position.index["theta_e"]].scale
 
     # Frames in
 
@@ -153,34 +159,25 @@ class Node:
         """PositionEstimate and ActiveFluxEstimate frames for the samples that are due, newest last."""
         frames = []
         for part in tracked:
-            run, rate = part.run, part.run.sample_rate
-            newest = int(run.counter[-1])
-            fresh = (newest - run.counter) & 0xFFFFFFFF <= OLDEST_ANSWER * rate
-            due = np.flatnonzero((run.counter % _every(rate, self.config.estimate.rate) == 0) & fresh)
+            counter, rate = part.run.counter, part.run.sample_rate
+            oldest = int(OLDEST_ANSWER * rate)
+            due = due_rows(counter, _every(rate, self.config.estimate.rate), oldest)
             if due.size:
                 frames.append(self._position(part, due))
-            due = np.flatnonzero((run.counter % _every(rate, self.config.estimate.flux_rate) == 0) & fresh)
+            due = due_rows(counter, _every(rate, self.config.estimate.flux_rate), oldest)
             if due.size:
                 frames.append(self._flux(part, due))
         return frames
 
     def _position(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
         e = part.estimate
-        flags = e.flags[due]
-        counters = self._position_counter + np.arange(due.size)
+        values = np.zeros((self._position_width, due.size))
+        position_values(part.run.counter, e.angle, e.sigma, e.flags, part.injecting, due, self._position_step,
+                        self._position_rows, values)
+        counters = np.arange(self._position_counter, self._position_counter + due.size)
         self._position_counter += due.size
         self.view.estimates += due.size
-        return self._protocol.encode(MessageKind.POSITION_ESTIMATE, self.number, {
-            "theta_e": self._protocol.angle(MessageKind.POSITION_ESTIMATE, "theta_e",
-                                            e.angle[speed.THETA_HAT, due]),
-            "omega_e": e.angle[speed.OMEGA, due],
-            "sigma_theta": np.degrees(e.sigma[due]),
-            "sample_counter": part.run.counter[due] & 0x3FF,
-            "valid": flags & confidence.VALID != 0,
-            "locked": flags & confidence.LOCKED != 0,
-            "polarity_known": flags & confidence.POLARITY_KNOWN != 0,
-            "injecting": part.injecting[due],
-        }, counters)
+        return self._protocol.encode(MessageKind.POSITION_ESTIMATE, self.number, values, counters)
 
     def _flux(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
         e = part.estimate
@@ -279,7 +276,6 @@ class FrameCounts:
     errors: int = 0
     remote: int = 0
     wrong_length: int = 0
-    own: int = 0
     by_kind: NDArray[np.int64] = field(default_factory=lambda: np.zeros(len(MessageKind), np.int64))
 
 
@@ -310,35 +306,34 @@ class Companion:
             return []
         self.counts.frames += n
         labels = self.protocol.classify(block.raw)
-        first = int(labels[0])
-        if first >= 0 and (n == 1 or bool((labels == first).all())):
-            # The usual case on a live bus: nothing but samples of one drive since the last look.
-            return self._feed_node(first % NODES, block, {MessageKind(first // NODES): np.arange(n)})
-        self._count_strangers(block, labels)
+        order = np.empty(n, np.intp)
+        begin = np.empty(_LABELS + 1, np.intp)
+        group_rows(labels, order, begin)
+        ends = begin.tolist()
+        self._count_strangers(block, order, ends)
         tracked: list[Tracked] = []
-        present = np.unique(labels)
-        for number in sorted({int(p) % NODES for p in present if p >= 0}):
-            rows = {MessageKind(int(p) // NODES): np.flatnonzero(labels == p)
-                    for p in present if p >= 0 and p % NODES == number}
-            tracked += self._feed_node(number, block, rows)
+        for number, node in self.nodes.items():
+            rows = {}
+            for kind in MessageKind:
+                at = kind * NODES + number - WRONG_LENGTH
+                if ends[at + 1] > ends[at]:
+                    rows[kind] = order[ends[at]:ends[at + 1]]
+                    self.counts.by_kind[kind] += ends[at + 1] - ends[at]
+            if rows:
+                tracked += node.feed(block, rows)
         return tracked
 
-    def _feed_node(self, number: int, block: FrameBlock,
-                   rows: dict[MessageKind, NDArray[np.intp]]) -> list[Tracked]:
-        for kind, where in rows.items():
-            self.counts.by_kind[kind] += where.size
-        node = self.nodes.get(number)
-        return node.feed(block, rows) if node is not None else []
-
-    def _count_strangers(self, block: FrameBlock, labels: NDArray[np.int16]) -> None:
+    def _count_strangers(self, block: FrameBlock, order: NDArray[np.intp], ends: list[int]) -> None:
+        if ends[-WRONG_LENGTH] == 0:
+            return
         counts = self.counts
-        counts.unknown += int((labels == UNKNOWN).sum())
-        counts.errors += int((labels == ERROR_FRAME).sum())
-        counts.remote += int((labels == REMOTE_FRAME).sum())
-        wrong = np.flatnonzero(labels == WRONG_LENGTH)
+        for label, name in ((UNKNOWN, "unknown"), (ERROR_FRAME, "errors"), (REMOTE_FRAME, "remote"),
+                            (WRONG_LENGTH, "wrong_length")):
+            at = label - WRONG_LENGTH
+            setattr(counts, name, getattr(counts, name) + ends[at + 1] - ends[at])
+        wrong = order[:ends[1]]
         if wrong.size:
-            counts.wrong_length += wrong.size
-            owners = self.protocol.id_lut[block.can_id[wrong] & 0x7FF] % NODES
+            owners = self.protocol.id_lut[block.can_id[wrong] & CAN_SFF_MASK] % NODES
             for number, node in self.nodes.items():
                 node.wrong_length += int((owners == number).sum())
 
@@ -373,5 +368,23 @@ def _every(sample_rate: float, rate: float) -> int:
     return max(1, round(sample_rate / rate))
 
 
+@kernel
+def group_rows(labels: NDArray[np.int16], order: NDArray[np.intp], begin: NDArray[np.intp]) -> None:
+    """Sort rows by label, in order of arrival within each: rows of label w stand in
+    order[begin[w - WRONG_LENGTH]:begin[w - WRONG_LENGTH + 1]].  labels as from Protocol.classify.
+    """
+    begin[:] = 0
+    for k in range(labels.shape[0]):
+        begin[labels[k] - WRONG_LENGTH + 1] += 1
+    for w in range(1, begin.shape[0]):
+        begin[w] += begin[w - 1]
+    place = begin.copy()
+    for k in range(labels.shape[0]):
+        w = labels[k] - WRONG_LENGTH
+        order[place[w]] = k
+        place[w] += 1
+
+
+_LABELS = len(MessageKind) * NODES - WRONG_LENGTH
 _NO_ROWS = np.zeros(0, np.intp)
 _NOTHING = FrameBlock.zeros(0)

@@ -40,7 +40,7 @@ class FrameBlock:
     t_ns: NDArray[np.int64]
 
     def __len__(self) -> int:
-        return self.raw.shape[0]
+        return len(self.raw)
 
     @classmethod
     def zeros(cls, n: int) -> FrameBlock:

@@ -8,7 +8,16 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipmsm_can.wire.sequence import FULL, NIBBLE, PENDING_MAX, RESTARTED, TIMING, Events, SampleRun, SampleSequencer
+from ipmsm_can.wire.sequence import (
+    FULL,
+    NIBBLE,
+    PENDING_MAX,
+    RESTARTED,
+    TIMING,
+    Events,
+    SampleRun,
+    SampleSequencer,
+)
 
 RATE = 5000.0
 PERIOD_NS = int(1e9 / RATE)

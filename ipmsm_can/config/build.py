@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ipmsm_can.config.model import CURRENT_LIMIT_SHARE, DriveConfig
+from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation.estimator import EstimatorSettings
 from ipmsm_can.injection.scheduler import InjectionSettings
 from ipmsm_can.wire.protocol import Waveform
@@ -19,9 +19,6 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
 def injection_settings(config: DriveConfig) -> InjectionSettings:
     """Settings of the injection scheduler, the current limit worked out."""
     i = config.injection
-    limit = i.current_limit
-    if limit is None:
-        limit = CURRENT_LIMIT_SHARE * config.build_motor().rated_current
     return InjectionSettings(i.enabled, Waveform[i.waveform.upper()], i.amplitude, i.frequency, i.speed_on,
-                             i.speed_off, i.excitation_on, i.excitation_off, i.ramp, limit, i.time_to_live,
-                             i.period)
+                             i.speed_off, i.excitation_on, i.excitation_off, i.ramp, config.current_limit,
+                             i.time_to_live, i.period)

@@ -28,6 +28,8 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.motor import Motor
 
+Floats = NDArray[np.float64]
+
 CORRELATION_TIME = 0.01
 """Time [s] over which a voltage error is taken as constant."""
 INNOVATION_TIME = 0.01
@@ -86,7 +88,8 @@ def widen(state: NDArray[np.void], flux_variance: float) -> None:
 
 
 @kernel
-def confidence_block(regression, flux, speed, state, sigma, flags):  # type: ignore[no-untyped-def]
+def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
+                     flags: NDArray[np.uint8]) -> None:
     """Judge a block.
 
     regression: float64 (7, N); flux: float64 (6, N) from an observer; speed: float64 (3, N).

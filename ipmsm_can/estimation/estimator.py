@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +110,7 @@ class Estimator:
             self._segment(samples, out)
             return out
         edges = [0, *(k for k in starts if k), n]
-        for begin, end in zip(edges, edges[1:], strict=False):
+        for begin, end in pairwise(edges):
             missing = int(gap[begin]) if gap is not None else 0
             if missing:
                 self._restart(missing, samples[:, begin])

@@ -32,7 +32,7 @@ def new_state(window: float, sample_rate: float) -> NDArray[np.void]:
 
 
 @kernel
-def excitation_block(regression, state, out):  # type: ignore[no-untyped-def]
+def excitation_block(regression: NDArray[np.float64], state: NDArray[np.void], out: NDArray[np.float64]) -> None:
     """Write the smallest eigenvalue [V^2 s] after each sample into out (N,); regression as from Lemma 1."""
     st = state[0]
     T_s = st.T_s

@@ -53,7 +53,8 @@ def parameters(motor: Motor, alpha: float, sample_rate: float) -> NDArray[np.voi
 
 
 @kernel
-def regression_block(samples, parameters, state, out):  # type: ignore[no-untyped-def]
+def regression_block(samples: NDArray[np.float64], parameters: NDArray[np.void], state: NDArray[np.void],
+                     out: NDArray[np.float64]) -> None:
     """Run Lemma 1 over a block.
 
     samples: float64 (4, N): i_alpha, i_beta [A peak], v_alpha, v_beta [V peak, mean of the interval].

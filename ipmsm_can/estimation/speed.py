@@ -40,13 +40,13 @@ def new_state(bandwidth: float, epsilon: float, sample_rate: float) -> NDArray[n
 
 
 @kernel
-def wrap(angle):  # type: ignore[no-untyped-def]
+def wrap(angle: float) -> float:
     """The angle [rad] brought into [-pi, pi)."""
     return angle - _TWO_PI * math.floor((angle + math.pi) / _TWO_PI)
 
 
 @kernel
-def speed_block(flux, state, out):  # type: ignore[no-untyped-def]
+def speed_block(flux: NDArray[np.float64], state: NDArray[np.void], out: NDArray[np.float64]) -> None:
     """Angle, smoothed angle and speed for a block.
 
     flux: float64 (>= 4, N), rows 2 and 3 the active flux x_hat [Wb].

@@ -37,7 +37,7 @@ def new_state(frequency: float, sample_rate: float) -> NDArray[np.void]:
 
 
 @kernel
-def meter_block(samples, state):  # type: ignore[no-untyped-def]
+def meter_block(samples: NDArray[np.float64], state: NDArray[np.void]) -> float:
     """Run over samples (4, N); returns the high-frequency current [A peak] after the block."""
     st = state[0]
     phase = st.phase

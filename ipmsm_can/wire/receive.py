@@ -12,12 +12,15 @@ from ipmsm_can.wire.protocol import BLOCK_SAMPLES, MessageKind, Protocol
 from ipmsm_can.wire.sequence import DUPLICATES, FULL, NIBBLE, TIMING, Events, SampleRun, SampleSequencer
 
 Rows = NDArray[np.intp]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 
 
 @kernel
-def _merge(rows_s, samples, rows_t, timings, rows_b, blocks, first_row, t_ns,  # type: ignore[no-untyped-def]
-           kind, counter, rate, t_out, values):
+def _merge(rows_s: Rows, samples: Floats, rows_t: Rows, timings: Floats, rows_b: Rows,
+           blocks: Floats, first_row: int, t_ns: Ints, kind: Ints, counter: Ints,
+           rate: Floats, t_out: Ints, values: Floats) -> int:
     """Events of sample, timing and block frames in order of arrival; returns how many.
 
     rows_*: where each frame stood in the block.  samples (5, .): i, v, counter.  timings (2, .): counter, rate.
@@ -118,7 +121,7 @@ class SampleReceiver:
         return self.sequencer.push(Events(kind[:n], counter[:n], rate[:n], t_ns[:n],
                                           values if n == room else np.ascontiguousarray(values[:, :n])))
 
-    def _finite(self, rows: Rows, values: NDArray[np.float64]) -> tuple[Rows, NDArray[np.float64]]:
+    def _finite(self, rows: Rows, values: Floats) -> tuple[Rows, Floats]:
         """Without the frames that hold a NaN or an infinity (possible in somebody's float signals)."""
         good = np.isfinite(values).all(axis=0)
         if good.all():
@@ -126,7 +129,7 @@ class SampleReceiver:
         self.bad_frames += int(good.size - good.sum())
         return rows[good], np.ascontiguousarray(values[:, good])
 
-    def _intact_blocks(self, block: FrameBlock, rows: Rows) -> tuple[Rows, NDArray[np.float64]]:
+    def _intact_blocks(self, block: FrameBlock, rows: Rows) -> tuple[Rows, Floats]:
         if not rows.size:
             return rows, self._no_blocks
         b, intact, counters = self._protocol.decode(MessageKind.DRIVE_SAMPLE_BLOCK, self._node, block.raw, rows)

@@ -19,6 +19,7 @@ Everything is counted.  Samples that arrive before the sample rate is known wait
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,9 @@ LONGEST_SILENCE = 60.0
 """A counter further ahead than this [s] is a restarted drive, not a gap."""
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 STATE = np.dtype([
     ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
@@ -60,14 +64,14 @@ class Events:
     TIMING.  t_ns (N,) int64 arrival time [ns].  values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
     """
 
-    kind: NDArray[np.int64]
-    counter: NDArray[np.int64]
-    rate: NDArray[np.float64]
-    t_ns: NDArray[np.int64]
-    values: NDArray[np.float64]
+    kind: Ints
+    counter: Ints
+    rate: Floats
+    t_ns: Ints
+    values: Floats
 
     def __len__(self) -> int:
-        return self.kind.shape[0]
+        return len(self.kind)
 
     def after(self, begin: int) -> Events:
         """The events from `begin` on."""
@@ -93,15 +97,15 @@ class SampleRun:
     """
 
     sample_rate: float
-    counter: NDArray[np.int64]
-    values: NDArray[np.float64]
+    counter: Ints
+    values: Floats
     filled: NDArray[np.uint8]
-    gap: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
+    gap: Ints
+    t_ns: Ints
 
 
 @kernel
-def _steps_since_last(nibble, t_ns, st):  # type: ignore[no-untyped-def]
+def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
     """How many samples lie between the last one and this 4-bit counter; 0 duplicate, negative late."""
     delta = (nibble - st.last) & 15
     if st.rate > 0.0:
@@ -109,7 +113,7 @@ def _steps_since_last(nibble, t_ns, st):  # type: ignore[no-untyped-def]
         expected = min(max(expected, -1e9), 1e9)
         steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
     else:
-        steps = delta if delta <= 8 else delta - 16
+        steps = int(delta if delta <= 8 else delta - 16)
     if steps < -15:
         steps = delta - 16 if delta else 0
     if steps > 0 and st.has_floor and st.last + steps < st.floor:
@@ -119,11 +123,11 @@ def _steps_since_last(nibble, t_ns, st):  # type: ignore[no-untyped-def]
     elif steps <= 0 and st.has_floor and st.floor - st.last >= 16:
         behind = st.floor - st.last - delta
         steps = delta + 16 * ((behind + 15) // 16)
-    return steps
+    return int(steps)
 
 
 @kernel
-def _timing(counter, rate, st, counts):  # type: ignore[no-untyped-def]
+def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
     """Take in a DriveTiming; True where the sample rate changed."""
     changed = rate != st.rate
     st.rate = rate
@@ -132,13 +136,13 @@ def _timing(counter, rate, st, counts):  # type: ignore[no-untyped-def]
     if not st.has_last:
         st.has_floor = 1
         st.floor = counter
-        return changed
+        return bool(changed)
     if not synced and not changed:
         # Counters were relative until now; the samples themselves are unbroken.
         st.last = counter - ((counter - st.last) & 15)
         st.has_floor = 1
         st.floor = counter
-        return changed
+        return bool(changed)
     ahead = (counter - st.last) & (_WRAP - 1)
     if ahead >= _WRAP // 2:
         ahead -= _WRAP
@@ -158,12 +162,13 @@ def _timing(counter, rate, st, counts):  # type: ignore[no-untyped-def]
     elif ahead >= 0:
         st.has_floor = 1
         st.floor = st.last + ahead
-    return changed
+    return bool(changed)
 
 
 @kernel
-def sequence(begin, kind, counter, rate, t_ns, values, max_gap, st_array, counts,  # type: ignore[no-untyped-def]
-             out_counter, out_values, out_filled, out_gap, out_t):
+def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, values: Floats,
+             max_gap: int, st_array: NDArray[np.void], counts: Ints, out_counter: Ints, out_values: Floats,
+             out_filled: NDArray[np.uint8], out_gap: Ints, out_t: Ints) -> tuple[int, int, int]:
     """Sequence events from `begin` on; stops after a change of sample rate.
 
     Returns (number of samples put out, next event, _DONE or _RATE_CHANGED).  The outputs need room for

@@ -51,7 +51,7 @@ def parameters(motor: Motor, alpha: float, gamma: float, epsilon: float,
 
 
 @kernel
-def _along(i_a, i_b, x_a, x_b, epsilon):  # type: ignore[no-untyped-def]
+def _along(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) -> float:
     """i^T sigma(x): the current along the estimated rotor axis [A peak]."""
     size = math.sqrt(x_a * x_a + x_b * x_b)
     if size >= epsilon:
@@ -60,7 +60,8 @@ def _along(i_a, i_b, x_a, x_b, epsilon):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def ges_block(samples, regression, parameters, state, out):  # type: ignore[no-untyped-def]
+def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], parameters: NDArray[np.void],
+              state: NDArray[np.void], out: NDArray[np.float64]) -> None:
     """Run the observer over a block.
 
     samples: float64 (4, N) as for the regression; only the currents are read.

@@ -1,0 +1,58 @@
+"""Which samples get an answer, and the PositionEstimate signals of those: one compiled call each."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.estimation.confidence import LOCKED, POLARITY_KNOWN, VALID
+
+POSITION_SIGNALS = ("theta_e", "omega_e", "sigma_theta", "sample_counter", "valid", "locked", "polarity_known",
+                    "injecting")
+"""Signals of PositionEstimate in the order that `position_values` takes their rows."""
+
+_TWO_PI = 2.0 * math.pi
+
+
+@kernel
+def _due(counter: NDArray[np.int64], every: int, oldest: int, out: NDArray[np.intp]) -> int:
+    newest = counter[counter.shape[0] - 1]
+    n = 0
+    for k in range(counter.shape[0]):
+        if counter[k] % every == 0 and (newest - counter[k]) & 0xFFFFFFFF <= oldest:
+            out[n] = k
+            n += 1
+    return n
+
+
+def due_rows(counter: NDArray[np.int64], every: int, oldest: int) -> NDArray[np.intp]:
+    """Rows whose sample counter is a multiple of `every` and at most `oldest` samples behind the last one."""
+    out = np.empty(counter.size, np.intp)
+    return out[:_due(counter, every, oldest, out)]
+
+
+@kernel
+def position_values(counter: NDArray[np.int64], angle: NDArray[np.float64], sigma: NDArray[np.float64],
+                    flags: NDArray[np.uint8],
+                    injecting: NDArray[np.uint8], due: NDArray[np.intp], step: float,
+                    rows: NDArray[np.intp], out: NDArray[np.float64]) -> None:
+    """Physical values of PositionEstimate for the rows `due`, into out (n_signals, len(due)).
+
+    angle (3, N): theta_hat, smoothed theta, omega [rad, rad/s electrical].  sigma (N,) [rad].  step: resolution
+    of theta_e on the wire [rad]; what would round up to a whole turn becomes 0.  rows: where in `out` each of
+    POSITION_SIGNALS belongs.
+    """
+    for m in range(due.shape[0]):
+        k = due[m]
+        theta = angle[0, k] - _TWO_PI * math.floor(angle[0, k] / _TWO_PI)
+        out[rows[0], m] = theta if theta < _TWO_PI - 0.5 * step else 0.0
+        out[rows[1], m] = angle[2, k]
+        out[rows[2], m] = math.degrees(sigma[k])
+        out[rows[3], m] = counter[k] & 0x3FF
+        out[rows[4], m] = 1.0 if flags[k] & VALID else 0.0
+        out[rows[5], m] = 1.0 if flags[k] & LOCKED else 0.0
+        out[rows[6], m] = 1.0 if flags[k] & POLARITY_KNOWN else 0.0
+        out[rows[7], m] = injecting[k]
