@@ -89,15 +89,16 @@ def _place(buf: _U64, n: int, table: _I64, s: int, bits: _U64) -> None:
 
 @kernel
 def _half_to_float(b: np.uint64) -> float:
-    exponent = np.int64((b >> np.uint64(10)) & np.uint64(0x1F))
-    mantissa = np.float64(b & np.uint64(0x3FF))
-    if exponent == 31:
-        value = np.inf if mantissa == 0.0 else np.nan
-    elif exponent == 0:
-        value = mantissa * 2.0 ** -24
-    else:
-        value = (1024.0 + mantissa) * 2.0 ** (exponent - 25)
-    return -value if b & np.uint64(0x8000) else value
+    sign = (b & np.uint64(0x8000)) << np.uint64(48)
+    exponent = (b >> np.uint64(10)) & np.uint64(0x1F)
+    mantissa = b & np.uint64(0x3FF)
+    if exponent == 0:
+        small = np.float64(mantissa) * 2.0 ** -24
+        return -small if sign else small
+    # A double's exponent has a bias of 1023 instead of 15; all ones means infinite or no number in both.
+    wide = np.uint64(2047) if exponent == 31 else exponent + np.uint64(1008)
+    pattern = sign | (wide << np.uint64(52)) | (mantissa << np.uint64(42))
+    return np.uint64(pattern).view(np.float64)
 
 
 @kernel
@@ -145,19 +146,34 @@ def _listed(ranges: _I64, start: int, stop: int, value: np.int64) -> bool:
 
 
 @kernel
-def _deselect(buf: _U64, n: int, table: _I64, ranges: _I64, s: int, spare: _U64, absent: _Bool) -> None:
-    """absent[:n]: a multiplexer above signal s selects another, or the frame is too short for it."""
-    end = table[s, END]
+def _mark_short(buf: _U64, n: int, end: int, absent: _Bool) -> None:
     for k in range(n):
-        absent[k] = np.int64((buf[0, k] >> np.uint64(32)) & np.uint64(0xFF)) < end
+        absent[k] |= np.int64((buf[0, k] >> np.uint64(32)) & np.uint64(0xFF)) < end
+
+
+@kernel
+def _deselect(buf: _U64, n: int, shortest: np.int64, table: _I64, ranges: _I64, s: int, spare: _U64,
+              absent: _Bool) -> None:
+    """absent[:n]: a multiplexer above signal s selects another, or the frame is too short for it."""
+    absent[:n] = False
+    if shortest < table[s, END]:
+        _mark_short(buf, n, table[s, END], absent)
     while table[s, PARENT] >= 0:
         parent = table[s, PARENT]
-        end = table[parent, END]
+        if shortest < table[parent, END]:
+            _mark_short(buf, n, table[parent, END], absent)
         _raw_bits(buf, n, table, parent, spare)
-        for k in range(n):
-            chosen = _listed(ranges, table[s, IDS], table[s, IDS_END], np.int64(spare[k]))
-            if not chosen or np.int64((buf[0, k] >> np.uint64(32)) & np.uint64(0xFF)) < end:
-                absent[k] = True
+        first = table[s, IDS]
+        stop = table[s, IDS_END]
+        if stop - first == 1:  # the usual case, without a branch
+            low = ranges[first, 0]
+            high = ranges[first, 1]
+            for k in range(n):
+                value = np.int64(spare[k])
+                absent[k] |= (value < low) | (value > high)
+        else:
+            for k in range(n):
+                absent[k] |= not _listed(ranges, first, stop, np.int64(spare[k]))
         s = parent
 
 
@@ -203,7 +219,7 @@ def decode_block(words: _U64, rows: _Rows, use_rows: bool, n_words: int, table: 
                 for k in range(n):
                     out[s, start + k] = _from_pattern(bits[k], table[s, LENGTH]) * scale + offset
             if table[s, PARENT] >= 0 or shortest < table[s, END]:
-                _deselect(buf, n, table, ranges, s, bits, absent)
+                _deselect(buf, n, shortest, table, ranges, s, bits, absent)
                 for k in range(n):
                     if absent[k]:
                         out[s, start + k] = np.nan
@@ -226,7 +242,7 @@ def decode_raw_block(words: _U64, rows: _Rows, use_rows: bool, n_words: int, tab
             for k in range(n):
                 out[s, start + k] = np.int64(bits[k])
             if table[s, PARENT] >= 0 or shortest < table[s, END]:
-                _deselect(buf, n, table, ranges, s, bits, absent)
+                _deselect(buf, n, shortest, table, ranges, s, bits, absent)
                 for k in range(n):
                     if absent[k]:
                         out[s, start + k] = 0
@@ -294,7 +310,7 @@ def encode_block(values: _F64, n_words: int, order: _Rows, table: _I64, scaling:
             for k in range(n):
                 bits[k] <<= rest
             if table[s, PARENT] >= 0:
-                _deselect(buf, n, table, ranges, s, spare, absent)
+                _deselect(buf, n, np.int64(64), table, ranges, s, spare, absent)
                 for k in range(n):
                     if absent[k]:
                         bits[k] = np.uint64(0)
