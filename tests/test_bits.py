@@ -122,6 +122,16 @@ def test_fd_frames_match_a_bit_string(can_id: int, length: int, draw: st.DataObj
         assert (nominal[0], fast[0]) == (len(slow_part) + len(fast_part), 0)
 
 
+@pytest.mark.parametrize("length", [1, 2, 16, 20])
+def test_fd_stuff_bit_due_after_the_last_data_bit_is_not_sent(length: int) -> None:
+    """Every last byte after 0x55, so that some end in exactly five equal bits."""
+    frames = [(0x2AA, b"\x55" * (length - 1) + bytes([k]), CANFD_FDF | CANFD_BRS) for k in range(256)]
+    nominal, fast = frame_bits(make_block(frames))
+    expected = [fd_strings(*frame) for frame in frames]
+    assert nominal.tolist() == [len(a) for a, _ in expected]
+    assert fast.tolist() == [len(b) for _, b in expected]
+
+
 def test_every_single_byte_payload() -> None:
     """Exhaustive where it is cheap: every identifier's frame with a byte that follows from it."""
     frames = [(i, bytes([i & 0xFF, i >> 3]), 0) for i in range(0x800)]

@@ -72,6 +72,22 @@ def test_counters_add_up_over_blocks() -> None:
     assert counters.last == "controller: receive buffer overflow"
 
 
+def test_every_state_bit_on_its_own() -> None:
+    expected = {0x04: BusState.WARNING, 0x08: BusState.WARNING, 0x10: BusState.PASSIVE,
+                0x20: BusState.PASSIVE, 0x40: BusState.ACTIVE, 0x01: BusState.UNKNOWN, 0x24: BusState.PASSIVE}
+    errors = decode_errors(block_of(*(f"20000004#00{bit:02X}000000000000" for bit in expected)))
+    assert errors.state.tolist() == list(expected.values())
+    # without the controller class the byte means nothing
+    assert decode_errors(block_of("20000008#0020000000000000")).state[0] == BusState.UNKNOWN
+
+
+def test_last_state_of_a_block_holds() -> None:
+    counters = ErrorCounters()
+    counters.update(block_of("20000204#0008000000006000", "20000204#0020000000008800", "20000001#",
+                             "20000204#0040000000000500"))
+    assert (counters.state, counters.worst, counters.tx_errors) == (BusState.ACTIVE, BusState.PASSIVE, 5)
+
+
 def test_bytes_beyond_the_length_tell_nothing() -> None:
     block = block_of("20000204#00FF00000000FFFF")
     block.raw[0, 4] = 1

@@ -211,6 +211,21 @@ def test_socketcan_needs_no_python_can() -> None:
     assert "SocketCAN socket" in done.stdout or "no CAN interface 'nosuchcan0'" in done.stdout
 
 
+def test_bus_kwargs_reach_the_adapter() -> None:
+    seen = {}
+
+    def bus(**options: Any) -> Any:
+        seen.update(options)
+        raise OSError("enough")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(can, "Bus", bus)
+        with pytest.raises(BusError, match="CAN bus 'pcan USB1' cannot be opened: enough"):
+            open_port({"a_interface": "pcan", "a_channel": "USB1", "a_bitrate": 250000, "channel": "other",
+                       "a_bus_kwargs": {"auto_reset": True}}, prefix="a")
+    assert seen == {"interface": "pcan", "channel": "USB1", "bitrate": 250000, "auto_reset": True}
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="SocketCAN is Linux")
 def test_unknown_socketcan_keyword_is_named() -> None:
     with pytest.raises(ValueError, match=r"bus keyword 'colour' is unknown to SocketCAN; allowed are can_"):

@@ -52,11 +52,11 @@ _SEND_NAP_S = 0.0002
 
 @kernel
 def _unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], frames: NDArray[np.uint8],
-            now_ns: int, raw: NDArray[np.uint8], t_ns: NDArray[np.int64], state: NDArray[np.int64]) -> int:
+            raw: NDArray[np.uint8], t_ns: NDArray[np.int64], state: NDArray[np.int64]) -> int:
     """Copy n received frames out as clean rows, with their time stamps; rearm their headers.
 
-    Returns the number of rows written.  state: last drop counter (32 bit), drops in all, frames without
-    a kernel time stamp, messages of an unknown size.
+    Returns the number of rows written; time -1 where the kernel gave none.  state: last drop counter
+    (32 bit), drops in all, frames without a time stamp, messages of an unknown size.
     """
     out = 0
     for j in range(n):
@@ -83,7 +83,6 @@ def _unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], fram
             state[_S_ODD] += 1
             continue
         if stamp < 0:
-            stamp = now_ns
             state[_S_NO_STAMP] += 1
         t_ns[out] = stamp
         room = 8 if size == 16 else 64
@@ -168,7 +167,7 @@ class SocketCanPort:
         self._in_address = ctypes.c_void_p(self._in.headers.ctypes.data)
         self._state = np.zeros(4, np.int64)
         # compiled (or loaded from the cache) now and not while the first frames are waiting
-        _unpack(0, self._in.headers, self._in.control, self._in.frames, 0,
+        _unpack(0, self._in.headers, self._in.control, self._in.frames,
                 np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64), self._state)
 
     def _prepare(self, fd: bool | None, receive_own: bool, loopback: bool, receive_buffer: int,
@@ -270,8 +269,10 @@ class SocketCanPort:
             self._check_receive(ctypes.get_errno() if n < 0 else 0)
             return FrameBlock(np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64))
         raw, t_ns = np.empty((n, FRAME_BYTES), np.uint8), np.empty(n, np.int64)
-        rows = _unpack(n, self._in.headers, self._in.control, self._in.frames, time.time_ns(), raw, t_ns,
-                       self._state)
+        unstamped = self._state[_S_NO_STAMP]
+        rows = _unpack(n, self._in.headers, self._in.control, self._in.frames, raw, t_ns, self._state)
+        if self._state[_S_NO_STAMP] != unstamped:
+            t_ns[t_ns < 0] = time.time_ns()
         return FrameBlock(raw[:rows], t_ns[:rows])
 
     def _set_timeout(self, timeout_s: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ipmsm_can.bus.logs import read_log
-from ipmsm_can.bus.port import BusError, open_port
+from ipmsm_can.bus.port import BusError, Port, open_port
 from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.frames import (
     CAN_EFF_FLAG,
@@ -78,7 +78,7 @@ def port() -> Iterator[SocketCanPort]:
         yield opened
 
 
-def collect(port: SocketCanPort, n: int, timeout_s: float = 2.0) -> FrameBlock:
+def collect(port: Port, n: int, timeout_s: float = 2.0) -> FrameBlock:
     """At least n frames, or what came before a silence."""
     parts: list[FrameBlock] = []
     while sum(map(len, parts)) < n:
@@ -186,7 +186,7 @@ def test_lost_frames_are_counted() -> None:
         assert 0 < len(kept) < 500
         # the kernel tells with the next frame that gets through
         sender.send(numbered(1))
-        assert len(small.receive(1.0)) == 1
+        assert len(collect(small, 1)) == 1
         assert small.drops == 500 - len(kept)
         sender.send(numbered(300))
         again = collect(small, 300, 0.05)
@@ -200,11 +200,12 @@ def test_blocks_stay_valid_and_are_bounded() -> None:
         sender.send(numbered(100))
         first = port.receive(1.0)
         copy = first.raw.copy(), first.t_ns.copy()
-        second = port.receive(1.0)
-        assert (len(first), len(second), len(port.receive(0.0))) == (64, 36, 0)
+        # the kernel may hand a burst on in several goes, so only the sum is certain
+        rest = collect(port, 100 - len(first))
+        assert 1 <= len(first) <= 64
         assert np.array_equal(first.raw, copy[0])
         assert np.array_equal(first.t_ns, copy[1])
-        assert np.array_equal(FrameBlock.concat([first, second]).raw, numbered(100).raw)
+        assert np.array_equal(FrameBlock.concat([first, rest]).raw, numbered(100).raw)
 
 
 def test_a_long_frame_leaves_nothing_behind_in_a_short_one(port: SocketCanPort) -> None:
@@ -222,7 +223,7 @@ def test_filters(port: SocketCanPort) -> None:
     with open_port({"interface": "socketcan", "channel": "vcan0", "can_filters": filters}) as picky:
         port.send(mixed())
         port.send(numbered(16))
-        found = picky.receive(0.5)
+        found = collect(picky, 5, 0.5)
         # error frames pass whatever the filters
         assert found.can_id.tolist() == [0x100, 0x5 | CAN_EFF_FLAG, CAN_ERR_FLAG | 4, 0x100, 0x101]
 
@@ -270,7 +271,7 @@ def test_interface_down_up_and_missing(port: SocketCanPort) -> None:
             with pytest.raises(BusError):
                 other.receive(0.1)  # told once, whenever it looks
             assert other.send(numbered(3)) == 3
-            assert len(shaky.receive(0.5)) == 3
+            assert len(collect(shaky, 3)) == 3
             subprocess.run(["ip", "link", "del", "vcan7"], check=True)
             with pytest.raises(BusError, match="vcan7"):
                 shaky.receive(0.1)
