@@ -80,17 +80,26 @@ def open_port(options: argparse.Namespace | Mapping[str, Any], *, prefix: str | 
 
     Raises ValueError for options that name no bus, BusError when the bus cannot be opened.
     """
-    given = dict(options) if isinstance(options, Mapping) else vars(options)
-    stem = f"{prefix}_" if prefix else ""
-    chosen: dict[str, Any] = {k: given[stem + k] for k in _KEYWORDS if given.get(stem + k) is not None}
-    extra: dict[str, Any] = dict(given.get(stem + "bus_kwargs") or {})
-    explicit = "interface" in chosen and "channel" in chosen
-    config = chosen if explicit else _with_configuration(chosen)
+    config, extra = bus_configuration(options, prefix=prefix)
     if config["interface"] == "socketcan" and _have_own_socketcan():
         return _open_socketcan(config, extra)
     from ipmsm_can.bus.pythoncan import PythonCanPort
 
     return PythonCanPort.open(config | extra)
+
+
+def bus_configuration(options: argparse.Namespace | Mapping[str, Any], *, prefix: str | None = None
+                      ) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What `open_port` would open: (python-can's keywords, those of --bus-kwargs); nothing is opened.
+
+    Raises ValueError for options that name no bus.
+    """
+    given = dict(options) if isinstance(options, Mapping) else vars(options)
+    stem = f"{prefix}_" if prefix else ""
+    chosen: dict[str, Any] = {k: given[stem + k] for k in _KEYWORDS if given.get(stem + k) is not None}
+    extra: dict[str, Any] = dict(given.get(stem + "bus_kwargs") or {})
+    explicit = "interface" in chosen and "channel" in chosen
+    return (chosen if explicit else _with_configuration(chosen)), extra
 
 
 def _have_own_socketcan() -> bool:

@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation.estimator import EstimatorSettings
 from ipmsm_can.injection.scheduler import InjectionSettings
-from ipmsm_can.wire.protocol import Waveform
+from ipmsm_can.wire.dbc import Database
+from ipmsm_can.wire.protocol import Protocol, Waveform
+
+
+def build_protocol(configs: Sequence[DriveConfig]) -> Protocol:
+    """The messages as wire.dbc describes them; the project's own where none is given.
+
+    Raises ValueError when the drives of one bus name different files, or the file does not fit.
+    """
+    files = sorted({str(c.wire.dbc or "") for c in configs})
+    if len(files) > 1:
+        named = " and ".join(name or "none" for name in files)
+        raise ValueError(f"wire.dbc is {named}; allowed is the same file for all drives on a bus")
+    return Protocol(Database.load(files[0]) if files and files[0] else None)
 
 
 def estimator_settings(config: DriveConfig) -> EstimatorSettings:

@@ -1,0 +1,92 @@
+"""Status in plain text: one line now and then for logs and pipes, and the summary at the end."""
+
+from __future__ import annotations
+
+import math
+
+from ipmsm_can.cli.status import BusStatus, DriveStatus, NodeStatus, RunStatus, Status
+
+SILENT = "SILENT (listening only)"
+TRANSMITTING = "TRANSMITTING"
+
+
+def voice(status: RunStatus) -> str:
+    """Whether the program sends: the one thing that must never be in doubt."""
+    return TRANSMITTING if status.transmit else SILENT
+
+
+def clock(seconds: float) -> str:
+    """h:mm:ss."""
+    whole = int(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+def angle(node: NodeStatus) -> str:
+    """Electrical angle 0..360 with its 1-sigma, or that there is none."""
+    if not node.known:
+        return "unknown"
+    return f"{math.degrees(node.theta) % 360.0:5.1f} deg +/- {math.degrees(node.sigma):.1f}"
+
+
+def turnaround(bus: BusStatus) -> str:
+    """p50 and p99."""
+    if math.isnan(bus.turnaround_p50):
+        return "no answer sent yet"
+    return f"p50 {1e6 * bus.turnaround_p50:.0f} us  p99 {1e6 * bus.turnaround_p99:.0f} us"
+
+
+def losses(node: NodeStatus) -> list[tuple[str, int]]:
+    """What went wrong with the samples, in the order of the display."""
+    return [("lost", node.lost), ("filled", node.filled), ("gaps", node.gaps), ("bad frames", node.bad_frames),
+            ("duplicates", node.duplicates), ("reordered", node.reordered), ("resyncs", node.resyncs),
+            ("restarts", node.restarts)]
+
+
+def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:
+    """What went wrong on the bus, in the order of the display."""
+    return [("unknown ids", bus.unknown), ("wrong length", bus.wrong_length), ("remote", bus.remote),
+            ("kernel drops", bus.drops), ("unsent", bus.unsent)]
+
+
+def line(status: Status) -> str:
+    """One line."""
+    if isinstance(status, DriveStatus):
+        drives = " | ".join(
+            f"drive {n.node} {n.rpm:+.1f} rpm (asked {n.reference_rpm:+.1f}), {n.torque:+.2f} N m, "
+            f"probing {n.waveform} {n.amplitude:.1f} V" for n in status.nodes)
+        return f"{clock(status.elapsed)} {status.sent_per_s:.0f} frames/s unsent {status.unsent} | {drives}"
+    bus = status.bus
+    text = (f"{clock(status.elapsed)} {voice(status)} load {100 * bus.load:.1f} % {bus.frames_per_s:.0f} frames/s"
+            f" drops {bus.drops}")
+    if bus.error_frames:
+        text += f" error frames {bus.error_frames}"
+    for n in status.nodes:
+        text += f" | drive {n.node} {n.state}"
+        if n.live:
+            text += (f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm, probing {n.injection}, "
+                     f"lost {n.lost} bad {n.bad_frames}")
+    return text
+
+
+def summary(status: Status) -> str:
+    """What happened, when all is over."""
+    if isinstance(status, DriveStatus):
+        text = f"{status.sent} frames sent in {status.elapsed:.1f} s, {status.unsent} unsent"
+        if status.slips:
+            text += f"; this machine was too slow for real time {status.slips} times"
+        refused = [f"drive {n.node} refused {n.rejected} commands" for n in status.nodes if n.rejected]
+        return "; ".join([text, *refused])
+    bus = status.bus
+    lines = [f"{voice(status)} for {status.elapsed:.1f} s on {bus.description}: {bus.frames} frames received, "
+             f"{bus.sent} sent, load at the end {100 * bus.load:.1f} %",
+             "bus: " + ", ".join(f"{name} {n}" for name, n in bus_troubles(bus)) + f"; {bus.errors}"]
+    if status.transmit:
+        lines.append(f"turnaround: {turnaround(bus)}")
+    for n in status.nodes:
+        if not n.received:
+            lines.append(f"drive {n.node} ({n.motor}): no samples came")
+            continue
+        lines.append(f"drive {n.node} ({n.motor}): {n.received} samples, "
+                     + ", ".join(f"{name} {count}" for name, count in losses(n)))
+        lines.append(f"  last: {n.state}, {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm")
+    return "\n".join(lines)

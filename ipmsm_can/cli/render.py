@@ -1,0 +1,140 @@
+"""The live display's picture of a status: ASCII only, made for 80 columns, words before colours."""
+
+from __future__ import annotations
+
+from rich.text import Text
+
+from ipmsm_can.cli import plain
+from ipmsm_can.cli.status import DriveStatus, NodeStatus, RunStatus, Status
+
+_BLOCK_LINES = 8
+_FIXED_LINES = 8
+_LABEL = 9
+
+
+def render(status: Status, width: int, height: int) -> Text:
+    """A status as at most `height` lines of at most `width` columns."""
+    lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
+    for one in lines:
+        one.truncate(width)
+    if len(lines) > height:
+        lines = [*lines[:height - 1], Text("... the window is too low for the rest", style="yellow")]
+    return Text("\n").join(lines)
+
+
+def _run(status: RunStatus, width: int, height: int) -> list[Text]:
+    badge = Text(f" {plain.voice(status)} ", style="bold black on yellow" if status.transmit else "reverse")
+    lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
+    whole = _FIXED_LINES + _BLOCK_LINES * len(status.nodes) <= height
+    if whole:
+        for node in status.nodes:
+            lines += [*_node(node, width), Text()]
+    else:
+        lines.append(Text(f"{'':3}{'state':10}{'angle (deg el.)':17}{'rpm (mech.)':>12}{'samples/s':>10}"
+                          f"{'lost':>7}{'bad':>5}  probing", style="dim"))
+        lines += [_row(node) for node in status.nodes]
+        lines.append(Text())
+    return lines + _bus(status)
+
+
+def _header(title: str, badge: Text, elapsed: float, description: str, width: int) -> list[Text]:
+    first = Text.assemble((title, "bold"), "  ", badge)
+    time = plain.clock(elapsed)
+    first.append(time.rjust(max(len(time) + 1, width - first.cell_len)))
+    end = "Ctrl-C ends"
+    second = Text(description, style="dim")
+    second.append(end.rjust(max(len(end) + 2, width - second.cell_len)))
+    return [first, second, Text()]
+
+
+def _labelled(label: str, *parts: str | tuple[str, str] | Text) -> Text:
+    return Text.assemble((f"  {label:{_LABEL}}", "dim"), *parts)
+
+
+def _flag(name: str, is_set: bool) -> tuple[str, str]:
+    return (f"  [{'x' if is_set else ' '}] {name}", "green" if is_set else "dim")
+
+
+def _trust_style(node: NodeStatus) -> str:
+    return "bold green" if node.valid else "bold yellow" if node.live else "bold red"
+
+
+def _counts(pairs: list[tuple[str, int]]) -> Text:
+    text = Text()
+    for k, (name, n) in enumerate(pairs):
+        text.append(f"{'  ' if k else ''}{name} ", style="red" if n else "dim")
+        text.append(str(n), style="bold red" if n else "")
+    return text
+
+
+def _node(node: NodeStatus, width: int) -> list[Text]:
+    head = Text.assemble((f"drive {node.node}", "bold"), f"  {node.motor}  ",
+                         (node.state, "green" if node.locked else "yellow" if node.live else "red"))
+    flags = Text.assemble(_flag("valid", node.valid), _flag("locked", node.locked),
+                          _flag("polarity", node.polarity_known))
+    head.append(" " * max(0, width - head.cell_len - flags.cell_len))
+    head.append(flags)
+    speed = (f"{node.rpm:+8.1f} rpm mechanical  {node.omega:+8.1f} rad/s electrical"
+             if node.live else "unknown")
+    probing = Text(node.injection)
+    if node.injecting:
+        probing.append("  (drive injects", style="cyan")
+        probing.append(f", {node.hf_current:.2f} A at that frequency)", style="cyan")
+    if node.rejected_commands:
+        probing.append(f"  {node.rejected_commands} commands refused", style="red")
+    losses = plain.losses(node)
+    return [
+        head,
+        _labelled("angle", f"{plain.angle(node) + ' electrical' if node.known else 'unknown':35}",
+                  (node.trust, _trust_style(node))),
+        _labelled("speed", speed),
+        _labelled("probing", probing),
+        _labelled("samples", f"{node.samples_per_s:.0f}/s of {node.sample_rate:.0f} Hz   estimates "
+                  f"{node.estimates_per_s:.0f}/s   excitation {node.excitation:.3g} V^2 s"),
+        _labelled("", _counts(losses[:4])),
+        _labelled("", _counts(losses[4:])),
+    ]
+
+
+def _row(node: NodeStatus) -> Text:
+    state = "VALID" if node.valid else "not valid" if node.live else "silent"
+    angle = plain.angle(node).replace("deg ", "") if node.known else "unknown"
+    speed = f"{node.rpm:+.1f}" if node.live else "-"
+    return Text.assemble(
+        (f"{node.node:2} ", "bold"), (f"{state:10}", _trust_style(node)), f"{angle:17}{speed:>12}"
+        f"{node.samples_per_s:>10.0f}", (f"{node.lost:>7}", "red" if node.lost else ""),
+        (f"{node.bad_frames:>5}", "red" if node.bad_frames else ""), f"  {node.injection}")
+
+
+def _bus(status: RunStatus) -> list[Text]:
+    bus = status.bus
+    load = (f"load {100 * bus.load:5.1f} %   {bus.frames_per_s:.0f} frames/s   received {bus.frames}   "
+            f"sent {bus.sent}")
+    lines = [Text.assemble(("bus", "bold"), " " * (_LABEL - 1), load),
+             _labelled("", _counts(plain.bus_troubles(bus)))]
+    if status.transmit:
+        lines.append(_labelled("answers", f"turnaround {plain.turnaround(bus)}"))
+    lines.append(_labelled("errors", (bus.errors, "red" if bus.error_frames else "")))
+    return lines
+
+
+def _drive(status: DriveStatus, width: int) -> list[Text]:
+    badge = Text(" simulated, TRANSMITTING ", style="bold black on yellow")
+    lines = _header(status.title, badge, status.elapsed, status.description, width)
+    for n in status.nodes:
+        on = n.amplitude > 0.0
+        lines += [
+            Text.assemble((f"drive {n.node}", "bold"), f"  {n.motor}  profile {n.profile}, at {n.time:.1f} s"),
+            _labelled("speed", f"{n.rpm:+8.1f} rpm mechanical   asked {n.reference_rpm:+8.1f}"),
+            _labelled("torque", f"{n.torque:+8.2f} N m              load  {n.load_torque:+8.2f}"),
+            _labelled("current", f"{n.current:8.2f} A peak"),
+            _labelled("probing", (f"{n.waveform}, {n.amplitude:.1f} V" if on else "off", "cyan" if on else ""),
+                      (f"  {n.rejected} commands refused" if n.rejected else "", "red")),
+            Text(),
+        ]
+    sent = f"{status.sent_per_s:.0f} frames/s   sent {status.sent}   "
+    lines.append(Text.assemble(("bus", "bold"), " " * (_LABEL - 1), sent,
+                               _counts([("unsent", status.unsent), ("too slow", status.slips)])))
+    left = max(0.0, status.duration - status.elapsed)
+    lines.append(_labelled("ends in", f"{left:.0f} s"))
+    return lines

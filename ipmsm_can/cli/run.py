@@ -1,0 +1,70 @@
+"""`ipmsm-can run`: the companion on a CAN bus."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from contextlib import nullcontext
+
+from ipmsm_can.cli import bus, plain
+
+HELP = """\
+Follow the drives on a CAN bus: rotor position, speed, and how far to trust them.
+Listens only, unless --transmit is given.
+"""
+EPILOG = """\
+examples:
+  ipmsm-can run drive.toml -i socketcan -c can0               listen
+  ipmsm-can run drive.toml -i socketcan -c can0 --transmit    answer: position, status, probing commands
+  ipmsm-can run left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000 --duration 60
+  CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
+
+On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.
+exit codes: 0 ended by you or by --duration, 1 the bus went away, 2 bad input
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.add_argument("configs", nargs="+", metavar="drive.toml", help="configuration of a drive, one file each")
+    parser.add_argument("--transmit", action="store_true",
+                        help="send estimates, status and injection commands; without it nothing is ever sent")
+    parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
+    parser.add_argument("--quiet", action="store_true", help="no status while it runs, only the summary")
+    bus.add_arguments(parser)
+
+
+def main(args: argparse.Namespace) -> int:
+    """Run the companion until it is told to end; returns the exit code."""
+    from ipmsm_can.config import load_configs
+
+    configs = load_configs(args.configs)
+    rates = bus.bit_rates(args, configs)
+    bus.check_named(args)
+
+    from ipmsm_can.bus.live import LiveRunner
+    from ipmsm_can.bus.port import BusError
+    from ipmsm_can.bus.warmup import warm_up_companion
+    from ipmsm_can.cli.monitor import RunMonitor
+    from ipmsm_can.cli.screen import Screen
+    from ipmsm_can.companion import Companion
+    from ipmsm_can.config.build import build_protocol
+
+    protocol = build_protocol(configs)
+    with bus.patience():
+        warm_up_companion(configs, protocol)
+    went_away: BusError | None = None
+    with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port:
+        runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates)
+        monitor = RunMonitor(runner)
+        with nullcontext() if args.quiet else Screen(monitor.status):
+            try:
+                runner.run(stop, monitor.observe)
+            except BusError as error:
+                went_away = error
+        status = monitor.status()
+    print(plain.summary(status))
+    if went_away is not None:
+        print(f"ipmsm-can run: the bus went away after {status.elapsed:.1f} s: {went_away}", file=sys.stderr)
+        return 1
+    return 0

@@ -1,0 +1,146 @@
+"""What a display shows, as plain numbers and words.
+
+Nothing here imports more than the standard library: a display runs in a process of its own, which is to be
+there at once, and gets these objects through a pipe.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class NodeStatus:
+    """One drive as the companion sees it.
+
+    live: samples are coming in; without it the numbers of the estimate are old and say nothing.
+    theta, sigma [rad electrical], omega [rad/s electrical], rpm [1/min mechanical], excitation [V^2 s].
+    hf_current, amplitude: measured current [A peak] and asked voltage [V peak] of the probing signal.
+    injection: state and reason in words.  injecting: what the drive says.
+    sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
+    """
+
+    node: int
+    motor: str
+    state: str
+    live: bool
+    theta: float
+    sigma: float
+    omega: float
+    rpm: float
+    valid: bool
+    locked: bool
+    polarity_known: bool
+    excitation: float
+    injection: str
+    injecting: bool
+    amplitude: float
+    hf_current: float
+    sample_rate: float
+    samples_per_s: float
+    estimates_per_s: float
+    received: int
+    lost: int
+    filled: int
+    gaps: int
+    duplicates: int
+    reordered: int
+    resyncs: int
+    restarts: int
+    bad_frames: int
+    rejected_commands: int
+
+    @property
+    def known(self) -> bool:
+        """There is an angle at all, valid or not."""
+        return self.live and self.sigma < math.pi and math.isfinite(self.theta)
+
+    @property
+    def trust(self) -> str:
+        """How far to trust the angle, in words."""
+        if not self.live:
+            return "no estimate"
+        if self.valid:
+            return "VALID"
+        if not self.known:
+            return "NOT VALID: angle unknown"
+        if not self.polarity_known:
+            return "NOT VALID: may be half a turn off"
+        return "NOT VALID: not locked" if not self.locked else "NOT VALID: too uncertain"
+
+
+@dataclass(frozen=True, slots=True)
+class BusStatus:
+    """The bus as this program sees it; load 0..1, turnaround [s], NaN before the first answer.
+
+    unknown: identifiers that are none of ours.  drops: frames the kernel lost for want of buffer.
+    errors: what error frames told, in words; error_frames: how many.
+    """
+
+    description: str
+    load: float
+    frames: int
+    frames_per_s: float
+    sent: int
+    unsent: int
+    unknown: int
+    remote: int
+    wrong_length: int
+    drops: int
+    error_frames: int
+    errors: str
+    turnaround_p50: float
+    turnaround_p99: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunStatus:
+    """Companion on a bus.  elapsed [s]; transmit: it may send."""
+
+    title: str
+    elapsed: float
+    transmit: bool
+    bus: BusStatus
+    nodes: tuple[NodeStatus, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DriveNodeStatus:
+    """One simulated drive.
+
+    time [s] of simulation.  rpm, reference_rpm: true and asked speed [1/min mechanical].  torque,
+    load_torque [N m].  current: |i| [A peak].  waveform, amplitude [V peak]: probing signal it makes now.
+    rejected: commands it refused.
+    """
+
+    node: int
+    motor: str
+    profile: str
+    time: float
+    rpm: float
+    reference_rpm: float
+    torque: float
+    load_torque: float
+    current: float
+    waveform: str
+    amplitude: float
+    rejected: int
+
+
+@dataclass(frozen=True, slots=True)
+class DriveStatus:
+    """Simulated drives on a bus.  elapsed [s]; slips: how often the machine was too slow for real time."""
+
+    title: str
+    elapsed: float
+    duration: float
+    description: str
+    sent: int
+    sent_per_s: float
+    unsent: int
+    slips: int
+    nodes: tuple[DriveNodeStatus, ...]
+
+
+Status = RunStatus | DriveStatus
