@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,10 @@ from ipmsm_can.config import (
     load_configs,
     parse_config,
 )
+from ipmsm_can.config.build import drive_node_settings, drive_parameters
 from ipmsm_can.config.keys import Quantity
+from ipmsm_can.config.simulation import SimulationConfig
+from ipmsm_can.drive.parameters import DriveNodeSettings, DriveParameters
 from ipmsm_can.motor import M1, M2
 
 M2_ONLY = '[motor]\npreset = "m2"\n'
@@ -327,3 +331,53 @@ def test_importing_the_configuration_is_cheap() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True,
                           cwd=Path(__file__).parents[1])
     assert done.stdout.strip() == "[]"
+
+
+def test_the_simulated_drive_takes_its_defaults_from_the_drive_itself() -> None:
+    config = parse_config(M2_ONLY)
+    assert drive_parameters(config) == DriveParameters(sample_rate=5000.0)
+    assert drive_node_settings(config) == DriveNodeSettings()
+    assert set(SimulationConfig.keys()) == {
+        f.name for kind in (DriveParameters, DriveNodeSettings) for f in fields(kind)}
+
+
+def test_every_key_of_the_simulated_drive_arrives() -> None:
+    given = {
+        "sample_rate": 8000.0, "substeps": 3, "v_dc": 300.0, "current_bandwidth": 150.0, "speed_bandwidth": 7.0,
+        "torque_limit": 4.0, "i_max": 3.0, "mtpa": True, "dead_time_voltage": 0.5, "dead_time_zone": 0.1,
+        "current_noise": 0.03, "current_offset": (0.1, -0.2), "adc_step": 0.005, "friction": 0.001,
+        "speed_imposed": True, "rotor_locked": False, "injection_limit": 20.0, "injection_ramp": 500.0,
+    }
+    sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0}
+    config = config_from({"motor": {"preset": "m2"}, "simulation": {**given, **sent}})
+    assert drive_parameters(config) == DriveParameters(**given)  # type: ignore[arg-type]
+    assert drive_node_settings(config) == DriveNodeSettings(**sent)  # type: ignore[arg-type]
+
+
+def test_sample_rate_of_the_simulated_drive() -> None:
+    def rate(text: str, fd: bool) -> float:
+        return drive_parameters(parse_config(M2_ONLY + text), fd).sample_rate
+
+    assert (rate("", False), rate("", True), rate("[simulation]\nfd = true", False)) == (5e3, 1e4, 1e4)
+    assert rate("[wire]\nsample_rate = '4 kHz'", True) == 4e3
+    assert rate("[wire]\nsample_rate = 4000\n[simulation]\nsample_rate = 6000", True) == 6e3
+
+
+def test_a_slow_real_drive_needs_no_simulation_that_goes_with_it() -> None:
+    config = parse_config(M2_ONLY + "[wire]\nsample_rate = 1000\n[injection]\nenabled = false")
+    with pytest.raises(ValueError, match=r"^simulation.current_bandwidth is 200.0; allowed is 0.001 to 83.33"):
+        drive_parameters(config)
+
+
+@pytest.mark.parametrize(("text", "expected"), [
+    ("sample_rate = 2000\ncurrent_bandwidth = 200",
+     "simulation.current_bandwidth is 200; allowed is a frequency of "
+     "at most simulation.sample_rate / 12, that is 166.667 Hz"),
+    ("speed_bandwidth = 51", "simulation.speed_bandwidth is 51; allowed is a frequency of at most a quarter"),
+    ("speed_imposed = true\nrotor_locked = true", "simulation.rotor_locked is true; allowed is false"),
+    ("substeps = 0", "simulation.substeps is 0; allowed is a whole number, from 1 to 1000"),
+    ("current_offset = 1", "simulation.current_offset is 1; allowed is an array of 2 values"),
+    ("vdc = 1", "simulation.vdc is not a known key; did you mean simulation.v_dc?"),
+])
+def test_what_is_wrong_with_a_simulated_drive(text: str, expected: str) -> None:
+    assert sentence(f"{M2_ONLY}[simulation]\n{text}").startswith(expected)

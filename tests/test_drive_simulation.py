@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from ipmsm_can.drive import control
+from ipmsm_can.drive.parameters import DriveParameters, torque_at_current
 from ipmsm_can.drive.profile import RPM, Profile, constant, demo, paper_ramp, torque_pulses
-from ipmsm_can.drive.simulation import DriveParameters, DriveSamples, DriveSimulation
+from ipmsm_can.drive.simulation import DriveSamples, DriveSimulation
 from ipmsm_can.motor import M1, M2, Motor
 
 Array = NDArray[np.float64]
@@ -167,7 +168,7 @@ def test_speed_follows_the_demo_through_reversal_and_standstill() -> None:
 def test_torque_step_rises_with_the_current_bandwidth() -> None:
     rises = []
     for bandwidth in (100.0, 200.0, 400.0):
-        parameters = replace(IDEAL, rotor_locked=True, current_bandwidth_hz=bandwidth)
+        parameters = replace(IDEAL, rotor_locked=True, current_bandwidth=bandwidth)
         r = DriveSimulation(M2, parameters, Profile(((0.0, 0.0),), ((0.01, 0.0), (0.01, 4.0)))).run(1000)
         assert r.torque[-1] == pytest.approx(4.0, rel=1e-3)
         assert r.torque.max() < 4.0 * 1.3
@@ -211,10 +212,10 @@ def test_torque_at_a_current_is_the_most_that_current_can_give() -> None:
     motor = Motor(4, 0.05, 1e-3, 5e-3, 0.1)
     best = minimize_scalar(lambda beta: -motor.torque(-20.0 * math.sin(beta), 20.0 * math.cos(beta)),
                            bounds=(0.0, 1.5), method="bounded", options={"xatol": 1e-9})
-    assert control.torque_at_current(motor, 20.0, True) == pytest.approx(-best.fun, rel=1e-9)
-    torque = control.torque_at_current(motor, 20.0, True)
+    assert torque_at_current(motor, 20.0, True) == pytest.approx(-best.fun, rel=1e-9)
+    torque = torque_at_current(motor, 20.0, True)
     assert math.hypot(*control.current_reference(torque, 4.0, 0.05, -4e-3, True)) == pytest.approx(20.0)
-    same = brentq(lambda i: motor.torque(0.0, i) - control.torque_at_current(motor, 20.0, False), 0.0, 50.0)
+    same = brentq(lambda i: motor.torque(0.0, i) - torque_at_current(motor, 20.0, False), 0.0, 50.0)
     assert same == pytest.approx(20.0)
 
 
@@ -395,8 +396,8 @@ def test_a_wrong_injection_command_is_refused_and_the_old_one_stays(
         ({"substeps": 0}, ["substeps", "0", "1 to 1000"]),
         ({"substeps": 2.0}, ["substeps", "2.0", "whole"]),
         ({"v_dc": 0.0}, ["v_dc", "0.0", "above 0"]),
-        ({"current_bandwidth_hz": 1000.0}, ["current_bandwidth_hz", "1000.0", "833.333"]),
-        ({"speed_bandwidth_hz": 51.0}, ["speed_bandwidth_hz", "51.0", "50"]),
+        ({"current_bandwidth": 1000.0}, ["current_bandwidth", "1000.0", "833.333"]),
+        ({"speed_bandwidth": 51.0}, ["speed_bandwidth", "51.0", "50"]),
         ({"torque_limit": -1.0}, ["torque_limit", "-1.0"]),
         ({"i_max": math.inf}, ["i_max", "inf"]),
         ({"current_noise": -0.1}, ["current_noise", "-0.1"]),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ipmsm_can.config.model import DriveConfig
+from ipmsm_can.drive.parameters import DriveNodeSettings, DriveParameters
 from ipmsm_can.estimation.estimator import EstimatorSettings
 from ipmsm_can.injection.scheduler import InjectionSettings
 from ipmsm_can.wire.dbc import Database
@@ -37,3 +38,21 @@ def injection_settings(config: DriveConfig) -> InjectionSettings:
     return InjectionSettings(i.enabled, Waveform[i.waveform.upper()], i.amplitude, i.frequency, i.speed_on,
                              i.speed_off, i.excitation_on, i.excitation_off, i.ramp, config.current_limit,
                              i.time_to_live, i.period)
+
+
+def drive_parameters(config: DriveConfig, fd: bool = False) -> DriveParameters:
+    """Settings of the simulated drive; fd: CAN FD was asked for, whatever simulation.fd says.
+
+    Raises ValueError naming the key where the sample rate of [wire] does not go with the bandwidths.
+    """
+    given = config.simulation.model_dump(include=set(DriveParameters.__dataclass_fields__))
+    try:
+        return DriveParameters(**{**given, "sample_rate": config.simulation_rate(fd)})
+    except ValueError as error:  # a sample rate from [wire] may not go with the rest
+        raise ValueError(f"simulation.{error}") from None
+
+
+def drive_node_settings(config: DriveConfig, fd: bool = False) -> DriveNodeSettings:
+    """What the simulated drive sends; fd as for `drive_parameters`."""
+    s = config.simulation
+    return DriveNodeSettings(s.fd or fd, s.timing_rate, s.status_rate, s.reference_rate)

@@ -12,7 +12,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from ipmsm_can.config.keys import in_toml
-from ipmsm_can.config.model import DriveConfig, KeyProblem
+from ipmsm_can.config.model import DriveConfig
+from ipmsm_can.config.section import KeyProblem
 from ipmsm_can.motor import PRESETS
 
 

@@ -14,7 +14,9 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from ipmsm_can.config import units
-from ipmsm_can.config.keys import Choice, FilePath, Key, Quantity, Switch
+from ipmsm_can.config.keys import Choice, FilePath, Quantity, Switch
+from ipmsm_can.config.section import KeyProblem, Section
+from ipmsm_can.config.simulation import CLASSICAL_RATE, FD_RATE, SimulationConfig
 from ipmsm_can.motor import PRESETS, Motor
 
 ObserverKind = Literal["ges"]
@@ -28,40 +30,6 @@ ROTATING_CONVERGENCE = 70.0
 
 CURRENT_LIMIT_SHARE = 0.15
 """Default limit of the high-frequency current as a share of the rated current."""
-
-
-class KeyProblem(ValueError):
-    """Keys that do not fit together.  key: the one to blame, dotted or inside the section; allowed: in words.
-
-    missing: the key has to be there and is not.
-    """
-
-    def __init__(self, key: str, allowed: str, missing: bool = False) -> None:
-        super().__init__(f"{key}: allowed is {allowed}")
-        self.key = key
-        self.allowed = allowed
-        self.missing = missing
-
-
-class Section(BaseModel):
-    """A table of the file: every field is a key and carries one `Key` that reads and describes it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @classmethod
-    def keys(cls) -> dict[str, Key]:
-        """The keys of the section in their order."""
-        return {
-            name: next(item for item in field.metadata if isinstance(item, Key))
-            for name, field in cls.model_fields.items()
-        }
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _read(cls, value: Any, info: ValidationInfo) -> Any:
-        assert info.field_name is not None
-        return cls.keys()[info.field_name].read(value)
-
 
 _FROM_PRESET = "from the preset"
 _MOTOR_NEEDS = ("pole_pairs", "psi_m", "L_d", "L_q", "R")
@@ -266,6 +234,7 @@ class DriveConfig(BaseModel):
     observer: ObserverConfig = ObserverConfig()
     estimate: EstimateConfig = EstimateConfig()
     injection: InjectionConfig = InjectionConfig()
+    simulation: SimulationConfig = SimulationConfig()
 
     @classmethod
     def sections(cls) -> dict[str, type[Section]]:
@@ -310,6 +279,11 @@ class DriveConfig(BaseModel):
                 f"{InjectionConfig.keys()['current_limit'].allowed}, or motor.rated_torque to derive it "
                 "from, or injection.enabled = false", missing=True)
         return self
+
+    def simulation_rate(self, fd: bool = False) -> float:
+        """Sample rate [Hz] of the simulated drive; fd: CAN FD was asked for from outside."""
+        given = self.simulation.sample_rate or self.wire.sample_rate
+        return given or (FD_RATE if fd or self.simulation.fd else CLASSICAL_RATE)
 
     def build_motor(self) -> Motor:
         """The motor's parameters."""

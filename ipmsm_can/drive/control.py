@@ -83,32 +83,22 @@ def current_reference(
     return mtpa_i_d(i_q, psi_m, L_0), i_q
 
 
-def torque_at_current(motor: Motor, current: float, mtpa: bool) -> float:
-    """Torque [N m] that a current of the given amplitude [A peak] gives under the chosen law."""
-    if not mtpa or motor.L_0 == 0.0:
-        return motor.torque(0.0, current)
-    # psi_m i_d + L_0 (2 i_d^2 - I^2) = 0
-    root = math.sqrt(motor.psi_m**2 + 8.0 * motor.L_0**2 * current**2)
-    i_d = 2.0 * motor.L_0 * current**2 / (motor.psi_m + root)
-    return motor.torque(i_d, math.sqrt(current**2 - i_d**2))
-
-
 def pack_control(
     motor: Motor,
     period: float,
-    current_bandwidth_hz: float,
-    speed_bandwidth_hz: float,
+    current_bandwidth: float,
+    speed_bandwidth: float,
     torque_max: float,
     v_max: float,
     mtpa: bool,
 ) -> NDArray[np.float64]:
     """Control parameters as the kernel takes them, with the gains of the asked bandwidths.
 
-    The current loop is tuned to a_c = 2 pi current_bandwidth_hz (Kp = a_c L), the speed loop to
-    a_s = 2 pi speed_bandwidth_hz with its integrator's corner a quarter of that (Kp = a_s J).
+    The current loop is tuned to a_c = 2 pi current_bandwidth (Kp = a_c L), the speed loop to
+    a_s = 2 pi speed_bandwidth with its integrator's corner a quarter of that (Kp = a_s J).
     """
-    a_c = 2.0 * math.pi * current_bandwidth_hz
-    a_s = 2.0 * math.pi * speed_bandwidth_hz
+    a_c = 2.0 * math.pi * current_bandwidth
+    a_s = 2.0 * math.pi * speed_bandwidth
     c = np.zeros(C_SIZE)
     c[C_PERIOD] = period
     c[C_POLE_PAIRS] = motor.pole_pairs

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.drive.parameters import DriveNodeSettings as DriveNodeSettings
 from ipmsm_can.drive.simulation import DriveSamples, DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.wire.e2e import E2EStatus, SequenceChecker
@@ -25,16 +26,6 @@ COMMAND_REJECTED = 1 << 5
 """Bit of DriveStatus.faults that says a command was refused since the last DriveStatus."""
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 _TEMPERATURE = 40.0
-
-
-@dataclass(frozen=True, slots=True)
-class DriveNodeSettings:
-    """What the drive sends: CAN FD blocks instead of single samples, and how often the rest [Hz, 0 = never]."""
-
-    fd: bool = False
-    timing_rate: float = 50.0
-    status_rate: float = 10.0
-    reference_rate: float = 500.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,125 @@
+"""Settings of the simulated drive: their defaults stand here, and only here.
+
+Nothing here needs a compiler, so that a configuration can be read and explained without one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from ipmsm_can.motor import Motor
+
+FINEST_CURRENT_LOOP = 12.0
+"""Least ratio of sample rate to current bandwidth: with 1.5 periods of delay it leaves 45 deg of phase."""
+
+
+@dataclass(frozen=True)
+class DriveParameters:
+    """Settings of the simulated drive.
+
+    sample_rate: control periods per second [Hz], 100..1e6.
+    substeps: RK4 steps in a control period, 1..1000.
+    v_dc: dc-link voltage [V], > 0; the voltage limit is v_dc / sqrt(3) [V peak].
+    current_bandwidth: bandwidth of the current loops [Hz], > 0 and at most sample_rate / 12.
+    speed_bandwidth: bandwidth of the speed loop [Hz], > 0 and at most current_bandwidth / 4.
+    torque_limit: [N m], > 0; None stands for 1.5 times the rated torque.
+    i_max: largest current reference [A peak], > 0; None stands for twice the rated current.
+    mtpa: maximum torque per ampere instead of i_d = 0.
+    dead_time_voltage: voltage each phase loses, against its current [V], >= 0.
+    dead_time_zone: current below which that loss fades out [A], > 0.
+    current_noise: standard deviation of the sensor noise per axis (alpha, beta) [A], >= 0.
+    current_offset: sensor offset (alpha, beta) [A].
+    adc_step: resolution of the current samples [A], 0 for none.
+    friction: viscous [N m s/rad mechanical], >= 0.
+    speed_imposed: a load machine makes the rotor follow the profile's speed exactly; the drive then
+        controls torque, and the profile's load torque is its torque reference.
+    rotor_locked: the rotor stays where it starts; torque control as above.
+    injection_limit: largest probing amplitude [V peak], >= 0, whatever is asked.
+    injection_ramp: fastest change of the probing amplitude [V/s], > 0.
+
+    Raises ValueError naming the setting, what it got and what it allows.
+    """
+
+    sample_rate: float = 10_000.0
+    substeps: int = 10
+    v_dc: float = 540.0
+    current_bandwidth: float = 200.0
+    speed_bandwidth: float = 15.0
+    torque_limit: float | None = None
+    i_max: float | None = None
+    mtpa: bool = False
+    dead_time_voltage: float = 0.0
+    dead_time_zone: float = 0.2
+    current_noise: float = 0.02
+    current_offset: tuple[float, float] = (0.0, 0.0)
+    adc_step: float = 0.0
+    friction: float = 0.0
+    speed_imposed: bool = False
+    rotor_locked: bool = False
+    injection_limit: float = 30.0
+    injection_ramp: float = 1000.0
+
+    def __post_init__(self) -> None:
+        _within("sample_rate", self.sample_rate, 100.0, 1e6, "Hz")
+        if not (isinstance(self.substeps, int) and 1 <= self.substeps <= 1000):
+            raise ValueError(f"substeps is {self.substeps!r}; allowed is a whole number from 1 to 1000")
+        _within("current_bandwidth", self.current_bandwidth, 1e-3,
+                self.sample_rate / FINEST_CURRENT_LOOP, "Hz (a twelfth of sample_rate)")
+        _within("speed_bandwidth", self.speed_bandwidth, 1e-3, self.current_bandwidth / 4.0,
+                "Hz (a quarter of current_bandwidth)")
+        for name, unit in (("v_dc", "V"), ("dead_time_zone", "A"), ("injection_ramp", "V/s"),
+                           ("torque_limit", "N m"), ("i_max", "A")):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value!r}; allowed is a finite number above 0, in {unit}")
+        for name, unit in (("dead_time_voltage", "V"), ("current_noise", "A"), ("adc_step", "A"),
+                           ("friction", "N m s/rad"), ("injection_limit", "V")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} is {value!r}; allowed is a finite number of 0 or more, in {unit}")
+        if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
+            raise ValueError(f"current_offset is {self.current_offset!r}; "
+                             "allowed are two finite numbers, in A")
+        if self.speed_imposed and self.rotor_locked:
+            raise ValueError("speed_imposed and rotor_locked are both true; allowed is one of them at most")
+
+    @property
+    def v_max(self) -> float:
+        """Largest voltage the inverter gives in every direction [V peak]."""
+        return self.v_dc / math.sqrt(3.0)
+
+    def noise_free(self) -> DriveParameters:
+        """The same drive with perfect current sensors."""
+        return replace(self, current_noise=0.0, current_offset=(0.0, 0.0), adc_step=0.0)
+
+    def torque_max(self, motor: Motor) -> float:
+        """Largest torque reference [N m]: the torque limit, or what i_max gives if that is less."""
+        limit = 1.5 * motor.rated_torque if self.torque_limit is None else self.torque_limit
+        i_max = 2.0 * motor.rated_current if self.i_max is None else self.i_max
+        return min(limit, torque_at_current(motor, i_max, self.mtpa))
+
+
+@dataclass(frozen=True)
+class DriveNodeSettings:
+    """What the drive sends: CAN FD blocks instead of single samples, and how often the rest [Hz, 0 = never]."""
+
+    fd: bool = False
+    timing_rate: float = 50.0
+    status_rate: float = 10.0
+    reference_rate: float = 500.0
+
+
+def _within(name: str, value: float, low: float, high: float, unit: str) -> None:
+    if not low <= value <= high:
+        raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g} {unit}")
+
+
+def torque_at_current(motor: Motor, current: float, mtpa: bool) -> float:
+    """Torque [N m] that a current of the given amplitude [A peak] gives under the chosen law."""
+    if not mtpa or motor.L_0 == 0.0:
+        return motor.torque(0.0, current)
+    # psi_m i_d + L_0 (2 i_d^2 - I^2) = 0
+    root = math.sqrt(motor.psi_m**2 + 8.0 * motor.L_0**2 * current**2)
+    i_d = 2.0 * motor.L_0 * current**2 / (motor.psi_m + root)
+    return motor.torque(i_d, math.sqrt(current**2 - i_d**2))
