@@ -240,3 +240,16 @@ def test_sentences(tmp_path: Path) -> None:
 def test_an_empty_log_has_no_blocks(tmp_path: Path) -> None:
     (tmp_path / "a.log").write_text("")
     assert list(read_log(tmp_path / "a.log")) == []
+
+
+def test_a_blf_that_ends_too_early_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.blf"
+    write_log(path, [random_block(20_000, 5)])
+    whole = path.read_bytes()
+    reader = read_log(path)
+    count = sum(len(b) for b in reader)
+    assert reader.problem == ""
+    path.write_bytes(whole[:len(whole) * 2 // 3])
+    reader = read_log(path)
+    assert 0 < sum(len(b) for b in reader) < count
+    assert "is cut off" in reader.problem and str(len(whole)) in reader.problem

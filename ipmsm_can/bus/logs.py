@@ -355,8 +355,17 @@ class LogReader:
                 raise LogError(self.problem) from error
         finally:
             reader.stop()
+        self.problem = self.problem or self._blf_problem(reader)
         if waiting:
             yield block_from_messages(waiting)
+
+    def _blf_problem(self, reader: can.io.generic.MessageReader) -> str:
+        """python-can reads a BLF file that ends too early without a word; its header knows the whole size."""
+        promised = getattr(reader, "file_size", 0) if self._kind[0] == ".blf" and not self._packed else 0
+        there = self.path.stat().st_size
+        if promised <= there:
+            return ""
+        return f"{self.path} is cut off: its header promises {promised} bytes and {there} are there"
 
 
 def _open(path: Path, packed: bool, mode: str) -> IO[bytes]:
