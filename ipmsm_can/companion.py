@@ -42,6 +42,7 @@ STALE_AFTER_NS = 50_000_000
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
 STATUS_VERSION = 1
+_STATUSES_KEPT = 4096
 
 _SAMPLE, _BLOCK, _TIMING, _STATUS = (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK,
                                      MessageKind.DRIVE_TIMING, MessageKind.DRIVE_STATUS)
@@ -91,6 +92,9 @@ class Node:
         self.scheduler = InjectionScheduler(injection_settings(config), transmit)
         self.wrong_length = 0
         self.injecting = False
+        self._said_at = np.zeros(0, np.int64)
+        self._said = np.zeros(1, np.bool_)
+        """Whether the drive said that it injects: entry k from after _said_at[k - 1] on."""
         self.rejected_commands = 0
         self._protocol = protocol
         self._motor = config.build_motor()
@@ -116,23 +120,34 @@ class Node:
         none = _NO_ROWS
         runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none),
                                   rows.get(_BLOCK, none))
-        before = self.injecting
         status = rows.get(_STATUS, none)
-        said: NDArray[np.float64] | None = None
         if status.size:
             values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
-            said = values[self._waveform_row]
-            self.injecting = bool(said[-1])
-            self.rejected_commands = int(values[self._rejected_row, -1])
-        tracked = []
-        for run in runs:
-            if said is None:
-                injecting = np.full(run.counter.size, before, np.uint8)
-            else:
-                latest = np.searchsorted(block.t_ns[status], run.t_ns, side="right")
-                injecting = np.concatenate([[before], said != 0])[latest].astype(np.uint8)
-            tracked.append(Tracked(self.number, run, self._estimate(run), injecting))
+            self._hear(block.t_ns[status], values[self._waveform_row] != 0)
+            self.rejected_commands = int(np.nan_to_num(values[self._rejected_row, -1]))
+        tracked = [Tracked(self.number, run, self._estimate(run), self._injected(run)) for run in runs]
+        if not self.receiver.sequencer.waiting and self._said_at.size > 1:
+            # Only samples from the time of the last DriveStatus on can still come.
+            self._forget(int(np.searchsorted(self._said_at, self._said_at[-1], side="left")))
         return tracked
+
+    def _hear(self, t_ns: NDArray[np.int64], injecting: NDArray[np.bool_]) -> None:
+        """Keep what DriveStatus said, and when, for the samples that come after it."""
+        self._said_at = np.concatenate([self._said_at, t_ns])
+        self._said = np.concatenate([self._said, injecting])
+        self.injecting = bool(self._said[-1])
+        self._forget(self._said_at.size - _STATUSES_KEPT)
+        set_back = np.flatnonzero(np.diff(self._said_at) < 0)
+        if set_back.size:
+            self._forget(int(set_back[-1]) + 1)
+
+    def _forget(self, oldest: int) -> None:
+        if oldest > 0:
+            self._said_at, self._said = self._said_at[oldest:], self._said[oldest:]
+
+    def _injected(self, run: SampleRun) -> NDArray[np.uint8]:
+        """What the last DriveStatus before each sample said: by time, so that blocks make no difference."""
+        return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")].astype(np.uint8)
 
     def _estimate(self, run: SampleRun) -> EstimateBlock:
         estimator = self._estimator

@@ -185,6 +185,34 @@ def test_configured_rate_serves_until_timing_comes() -> None:
     assert sequencer.count("restarts") == 0
 
 
+def test_configured_rate_does_not_depend_on_blocks() -> None:
+    """A DriveTiming in the same block as the first samples changes nothing."""
+    counters = []
+    for together in (True, False):
+        sequencer, sender = SampleSequencer(8, sample_rate=RATE), Sender()
+        runs = []
+        for k in range(2005, 2010):
+            sender.sample(k)
+        if not together:
+            runs += sequencer.push(sender.events())
+        sender.timing(2009)
+        sender.sample(2010)
+        runs += sequencer.push(sender.events())
+        counters.append(np.concatenate([r.counter for r in runs]).tolist())
+    assert counters[0] == counters[1]
+    assert counters[0][-1] == 2010
+
+
+def test_a_clock_that_was_set_back_stops_nothing() -> None:
+    sequencer, sender = SampleSequencer(8, sample_rate=RATE), Sender()
+    for k in range(100):
+        hour = 3600 * 10**9 if k < 50 else 0
+        sender.sample(k, t_ns=hour + k * PERIOD_NS)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter.size == 100 and not run.gap.any()
+    assert sequencer.count("reordered") == 0
+
+
 def test_restarted_drive() -> None:
     sequencer, sender = synced(1_000_000)
     sender.timing(3, t_ns=1_000_100 * PERIOD_NS)

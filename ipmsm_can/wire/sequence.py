@@ -110,7 +110,8 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
     delta = (nibble - st.last) & 15
     if st.rate > 0.0:
         expected = (t_ns - st.last_t) * 1e-9 * st.rate
-        expected = min(max(expected, -1e9), 1e9)
+        # A clock that was set back says nothing; believed, it would make every sample that follows "late".
+        expected = min(max(expected, 0.0), 1e9)
         steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
     else:
         steps = int(delta if delta <= 8 else delta - 16)
@@ -286,6 +287,8 @@ class SampleSequencer:
         """Take in events; returns the samples they complete, in runs of one sample rate each."""
         if not len(events):
             return []
+        if self.sample_rate == 0.0 and self._fallback_rate is not None:
+            self._state["rate"] = self._fallback_rate
         if self.sample_rate == 0.0:
             if self._pending is not None:
                 events = Events.joined(self._pending, events)
@@ -294,9 +297,6 @@ class SampleSequencer:
             if timings.size:
                 self._pending = None
                 self._synchronise(events, int(timings[0]))
-            elif self._fallback_rate is not None:
-                self._pending = None
-                self._state["rate"] = self._fallback_rate
             else:
                 over = len(events) - PENDING_MAX
                 if over > 0:
