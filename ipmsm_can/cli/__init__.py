@@ -12,6 +12,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import NoReturn
 
 from ipmsm_can import __version__
 
@@ -42,10 +43,17 @@ exit codes: 0 all well, 1 ran and found a fault, 2 bad input
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """Answers wrong arguments with one sentence; ten lines of usage would bury it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (`{self.prog} --help` explains)\n")
+
+
 def build_parser(commands: Sequence[str]) -> argparse.ArgumentParser:
     """The parser; only the commands named get their arguments, the others just their line in the help."""
-    parser = argparse.ArgumentParser(prog="ipmsm-can", description=_DESCRIPTION, epilog=_EPILOG,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _Parser(prog="ipmsm-can", description=_DESCRIPTION, epilog=_EPILOG,
+                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--version", action="version", version=f"ipmsm-can {__version__}")
     sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, text in COMMANDS.items():

@@ -64,7 +64,7 @@ class RunMonitor:
         self.errors = ErrorCounters()
         self._begin = time.monotonic()
         self._errors_seen = 0
-        self._rates = Rates()
+        self._rates = Rates(self._begin)
         self._turnaround = (math.nan, math.nan)
         self._next_quantiles = 0.0
 
@@ -129,13 +129,16 @@ def injection_words(state: InjectionState, reason: InjectionReason, amplitude: f
 
 
 class Rates:
-    """Events per second from counters, over about the last second."""
+    """Events per second from counters that begin at 0, over about the last second.
 
-    def __init__(self) -> None:
-        self._past: deque[tuple[float, dict[str, int]]] = deque()
+    begin: time [s] on the clock of `update`.
+    """
+
+    def __init__(self, begin: float) -> None:
+        self._past: deque[tuple[float, dict[str, int]]] = deque([(begin, {})])
 
     def update(self, now: float, counted: dict[str, int]) -> dict[str, float]:
-        """The rates [1/s] now; 0 with the first call."""
+        """The rates [1/s] now."""
         past = self._past
         past.append((now, counted))
         while len(past) > 2 and past[1][0] <= now - _RATE_WINDOW_S:
@@ -154,7 +157,7 @@ class DriveMonitor:
         self._duration = duration
         self._begin = time.monotonic()
         self._latest: dict[int, Step] = {}
-        self._rates = Rates()
+        self._rates = Rates(self._begin)
 
     def observe(self, node: int, step: Step) -> None:
         """Keep the latest stretch of simulation."""
