@@ -24,6 +24,7 @@ from ipmsm_can.injection import meter
 from ipmsm_can.injection.scheduler import Command, InjectionScheduler
 from ipmsm_can.wire.answers import POSITION_SIGNALS, due_rows, position_values
 from ipmsm_can.wire.protocol import (
+    BLOCK_SAMPLES,
     ERROR_FRAME,
     NODES,
     REMOTE_FRAME,
@@ -102,6 +103,7 @@ class Node:
         self._estimator: Estimator | None = None
         self._meter = meter.new_state(config.injection.frequency, 1.0)
         self._last_arrival: int | None = None
+        self._samples_per_frame = 1
         self._next_status: int | None = None
         self._next_command: int | None = None
         self._position_counter = 0
@@ -118,8 +120,10 @@ class Node:
     def feed(self, block: FrameBlock, rows: dict[MessageKind, NDArray[np.intp]]) -> list[Tracked]:
         """Take in this node's frames (row numbers by kind) and estimate from the samples they complete."""
         none = _NO_ROWS
-        runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none),
-                                  rows.get(_BLOCK, none))
+        blocks = rows.get(_BLOCK, none)
+        runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none), blocks)
+        if runs:
+            self._samples_per_frame = BLOCK_SAMPLES if blocks.size else 1
         status = rows.get(_STATUS, none)
         if status.size:
             values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
@@ -238,14 +242,14 @@ class Node:
     def _fresh(self, now_ns: int) -> bool:
         return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS
 
-    def next_due_ns(self) -> int | None:
-        """When the next sample that gets a PositionEstimate should arrive; None while nothing is known."""
+    def frames_until_due(self, now_ns: int) -> int:
+        """Sample frames to come up to the next one that gets a PositionEstimate; 0 while samples do not flow."""
         view = self.view
-        if self._last_arrival is None or view.sample_rate <= 0.0:
-            return None
+        if view.sample_rate <= 0.0 or not self._fresh(now_ns):
+            return 0
         every = _every(view.sample_rate, self.config.estimate.rate)
         left = every - view.sample % every
-        return self._last_arrival + round(left * 1e9 / view.sample_rate)
+        return -(-left // self._samples_per_frame)
 
     def update_state(self, now_ns: int) -> CompanionState:
         """The state as of now, which is also what CompanionStatus says."""
@@ -352,10 +356,10 @@ class Companion:
             for number, node in self.nodes.items():
                 node.wrong_length += int((owners == number).sum())
 
-    def next_due_ns(self) -> int | None:
-        """Earliest time at which a sample that is to be answered should arrive; None if nothing is known."""
-        times = [t for t in (node.next_due_ns() for node in self.nodes.values()) if t is not None]
-        return min(times) if times else None
+    def frames_until_due(self, now_ns: int) -> int:
+        """How many frames a runner may wait for without being late with an answer, at least 1."""
+        flowing = [n for n in (node.frames_until_due(now_ns) for node in self.nodes.values()) if n]
+        return min(flowing) if flowing else 1
 
     def process(self, block: FrameBlock, now_ns: int) -> FrameBlock:
         """Take in frames and give back what is to be sent now.

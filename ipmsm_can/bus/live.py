@@ -1,8 +1,10 @@
 """The companion on a live bus: receive, think, answer; and how long that takes.
 
 Between two answers there is nothing to do but collect samples.  A process that wakes up for every frame pays
-for every frame; so after an answer the runner sleeps until shortly before the next sample that is to be
-answered should arrive, and takes the ones in between in one go.
+for every frame; so the runner asks the port for as many frames as are missing until the next sample that is
+to be answered, and is woken once, by that one.
+
+The clock is the frames' own: the time of the newest frame is now.  Only silence is timed by the runner.
 """
 
 from __future__ import annotations
@@ -21,11 +23,12 @@ from ipmsm_can.frames import FrameBlock
 
 IDLE_S = 0.02
 """Longest wait for a frame: the clock makes status and commands due."""
-MARGIN_S = 0.0003
-"""How long before the expected arrival of the next answered sample the sleep ends."""
-SHORTEST_SLEEP_S = 0.0002
-LONGEST_SLEEP_S = 0.005
+TURNAROUND_EVERY = 8
+"""Of so many answers, one is timed: reading the clock is not free everywhere."""
+LOAD_EVERY = 32
+"""Rounds after which the bus load is worked out."""
 _KEPT = 1 << 16
+_ABSURD_S = 10.0
 
 Observer = Callable[[FrameBlock, Sequence[Tracked], FrameBlock, int], None]
 """Called after each round with what came in, what was estimated, what was sent, and the time [ns]."""
@@ -61,6 +64,10 @@ class LiveRunner:
         self.turnaround = Turnaround()
         self.load = BusLoad(bitrate, data_bitrate)
         self.sent = 0
+        self._now_ns = 0
+        self._answered = 0
+        self._unweighed: list[FrameBlock] = []
+        self._rounds = 0
 
     def run(self, stop: Callable[[], bool], observer: Observer | None = None) -> None:
         """Serve the bus until stop() says so; raises BusError when the bus goes away."""
@@ -68,32 +75,42 @@ class LiveRunner:
             self.round(observer)
 
     def round(self, observer: Observer | None = None) -> None:
-        """Wait for frames, answer them, sleep while nothing is to be answered."""
-        block = self.port.receive(IDLE_S)
-        now = time.time_ns()
+        """Wait for the frames up to the next one that is to be answered, and answer."""
         companion = self.companion
+        block = self.port.receive(IDLE_S, companion.frames_until_due(self._now_ns))
+        now = self._time(block)
         tracked = companion.feed(block)
         answers = companion.respond(tracked, now)
         if len(answers):
             self.sent += self.port.send(answers)
             if tracked:
-                took = 1e-9 * (time.time_ns() - int(tracked[-1].run.t_ns[-1]))
-                self.turnaround.add(took)
-                companion.turnaround = took
-        if len(block):
-            self.load.update(block)
-        if len(answers):
-            self.load.update(answers)
-        companion.bus_load = self.load.load(now)
+                self._time_answer(int(tracked[-1].run.t_ns[-1]))
+        self._weigh(block, answers, now)
         if observer is not None:
             observer(block, tracked, answers, now)
-        if len(answers):
-            self._rest()
 
-    def _rest(self) -> None:
-        due = self.companion.next_due_ns()
-        if due is None:
+    def _time(self, block: FrameBlock) -> int:
+        if len(block):
+            self._now_ns = int(block.t_ns[-1])
+        elif self._now_ns:
+            self._now_ns += round(1e9 * IDLE_S)
+        else:
+            self._now_ns = time.time_ns()
+        return self._now_ns
+
+    def _time_answer(self, arrived_ns: int) -> None:
+        self._answered += 1
+        if self._answered % TURNAROUND_EVERY:
             return
-        sleep = 1e-9 * (due - time.time_ns()) - MARGIN_S
-        if sleep > SHORTEST_SLEEP_S:
-            time.sleep(min(sleep, LONGEST_SLEEP_S))
+        took = 1e-9 * (time.time_ns() - arrived_ns)
+        if 0.0 <= took < _ABSURD_S:  # else the adapter stamps by a clock of its own
+            self.turnaround.add(took)
+            self.companion.turnaround = took
+
+    def _weigh(self, block: FrameBlock, answers: FrameBlock, now_ns: int) -> None:
+        self._unweighed += [block, answers]
+        self._rounds += 1
+        if self._rounds % LOAD_EVERY == 0:
+            self.load.update(FrameBlock.concat(self._unweighed))
+            self._unweighed.clear()
+            self.companion.bus_load = self.load.load(now_ns)

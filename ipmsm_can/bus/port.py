@@ -44,6 +44,9 @@ class Port(Protocol):
     def receive(self, timeout_s: float) -> FrameBlock:
         """Wait for a frame, at most timeout_s (0 does not wait), then take all there are, up to a maximum.
 
+        With expect > 1 it waits for that many, at most timeout_s for each, and takes no more: a reader that
+        knows when it will have something to do is not woken before.
+
         Returns an empty block on time-out or a signal.  The block stays valid.  t_ns is Unix time.
         Raises BusError when the interface went down or away.
         """

@@ -144,22 +144,23 @@ class PythonCanPort:
     def unsent(self) -> int:
         return self._unsent
 
-    def receive(self, timeout_s: float) -> FrameBlock:
+    def receive(self, timeout_s: float, expect: int = 1) -> FrameBlock:
         """See `Port.receive`.  Raises ValueError for a negative timeout_s."""
         import can
 
         if not timeout_s >= 0.0:
             raise ValueError(f"timeout_s is {timeout_s!r}; allowed is 0 or more seconds")
         messages: list[can.Message] = []
+        most = self._max_frames if expect <= 1 else min(expect, self._max_frames)
         try:
             message = self._bus.recv(timeout_s)
             while message is not None:
                 if not message.timestamp:
                     message.timestamp = time.time()
                 messages.append(message)
-                if len(messages) == self._max_frames:
+                if len(messages) == most:
                     break
-                message = self._bus.recv(0)
+                message = self._bus.recv(timeout_s if expect > 1 else 0)
         except (can.CanError, OSError) as error:
             if not messages:  # else hand over what we have; the error comes back with the next call
                 raise BusError(f"receiving from {self._name} failed: {error}") from error

@@ -250,7 +250,7 @@ class SocketCanPort:
         """The socket's handle, for select and event loops."""
         return self._handle
 
-    def receive(self, timeout_s: float) -> FrameBlock:
+    def receive(self, timeout_s: float, expect: int = 1) -> FrameBlock:
         """See `Port.receive`.  A time-out that stays the same from call to call costs no extra system call;
         the kernel rounds it up to its tick (1 to 10 ms).
 
@@ -259,12 +259,13 @@ class SocketCanPort:
         if timeout_s > 0.0:
             if timeout_s != self._timeout_s:
                 self._set_timeout(timeout_s)
-            flags = _MSG_WAITFORONE
+            flags = _MSG_WAITFORONE if expect <= 1 else 0
         elif timeout_s == 0.0:
             flags = _MSG_DONTWAIT
         else:
             raise ValueError(f"timeout_s is {timeout_s!r}; allowed is 0 or more seconds")
-        n = self._libc.recvmmsg(self._handle, self._in_address, self._rows, flags, None)
+        most = self._rows if flags else min(expect, self._rows)
+        n = self._libc.recvmmsg(self._handle, self._in_address, most, flags, None)
         if n <= 0:
             self._check_receive(ctypes.get_errno() if n < 0 else 0)
             return FrameBlock(np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64))

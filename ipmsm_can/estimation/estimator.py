@@ -101,7 +101,8 @@ class Estimator:
         samples: float64 (4, N), C-contiguous: i_alpha, i_beta [A peak], v_alpha, v_beta [V peak, mean of the
         interval that ended at the sample].
         gap: int64 (N,), number of samples missing right before each one, or None for none at all; a gap
-        restarts the filters and carries flux and angle over it with the last speed.
+        restarts the filters and carries flux and angle over it with the last speed.  Negative: an earlier gap
+        had been given too long by so much.
         """
         n = samples.shape[1]
         out = EstimateBlock.empty(n)
@@ -155,8 +156,8 @@ class Estimator:
                 size = held
             fresh["lambda_a"] = size * math.cos(angle) + self.motor.L_q * first[0]
             fresh["lambda_b"] = size * math.sin(angle) + self.motor.L_q * first[1]
-            wrapped = math.remainder(angle, 2.0 * math.pi)
-            pll["theta"] = pll["theta_hat"] = math.remainder(wrapped - turned / (missing + 1), 2.0 * math.pi)
+            one_step_back = angle - float(pll["omega"][0]) / self.sample_rate
+            pll["theta"] = pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
             doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
             drift = s.voltage_uncertainty * elapsed
             confidence.widen(self._confidence, doubt**2 + drift**2)

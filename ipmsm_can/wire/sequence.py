@@ -1,8 +1,9 @@
 """From sample frames in order of arrival to samples in order of time.
 
 Time comes from the drive's sample counter.  A classical DriveSample carries its low four bits, so a longer
-silence leaves open how many whole wraps went by: the arrival time gives the first guess, and the 32-bit
-counter of the next DriveTiming settles it.  A DriveSampleBlock carries the whole counter.
+silence leaves open how many whole wraps went by: the arrival time gives the first guess.  A guess that was
+too high shows when samples then seem to arrive before they were taken; in any case the 32-bit counter of the
+next DriveTiming settles it.  A DriveSampleBlock carries the whole counter.
 
 What can happen, and what is done:
 
@@ -35,6 +36,8 @@ RESTARTED = 1 << 40
 """Value of `gap` at the first sample after the drive restarted: nothing before it counts."""
 LONGEST_SILENCE = 60.0
 """A counter further ahead than this [s] is a restarted drive, not a gap."""
+LATE_AT_MOST = 64.0
+"""Longest silence [samples] after which the next counter value is taken for a late sample."""
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
 
@@ -43,8 +46,8 @@ Ints = NDArray[np.int64]
 
 STATE = np.dtype([
     ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
-    ("rate", "f8"), ("synced", "i8"), ("restarted", "i8"), ("broken", "i8"), ("seen", "u8"),
-    ("values", "f8", (4,)),
+    ("rate", "f8"), ("synced", "i8"), ("guess", "i8"), ("offset", "i8"), ("restarted", "i8"),
+    ("correction", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
 ])
 
 RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
@@ -92,8 +95,8 @@ class SampleRun:
 
     sample_rate [Hz].  counter (M,) int64: the drive's 32-bit counter.  values (4, M), C-contiguous.
     filled (M,) uint8: 1 where interpolated.  gap (M,) int64: samples missing right before this one (0 where
-    none, RESTARTED after a restart of the drive).  t_ns (M,) int64: arrival of the frame (filled: of the
-    frame that closed the gap).
+    none, RESTARTED after a restart of the drive, negative where an earlier gap had been taken for too long).
+    t_ns (M,) int64: arrival of the frame (filled: of the frame that closed the gap).
     """
 
     sample_rate: float
@@ -112,7 +115,13 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
         expected = (t_ns - st.last_t) * 1e-9 * st.rate
         # A clock that was set back says nothing; believed, it would make every sample that follows "late".
         expected = min(max(expected, 0.0), 1e9)
-        steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
+        if delta == 1 and expected <= LATE_AT_MOST:
+            # Exactly the next one: late rather than exactly 16, 32, ... lost.
+            steps = 1
+        else:
+            steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
+            if steps > 16:
+                st.guess += (steps - 1) // 16
     else:
         steps = int(delta if delta <= 8 else delta - 16)
     if steps < -15:
@@ -121,6 +130,7 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
         # DriveTiming said that `floor` had been sent before this frame: whole wraps are missing.
         behind = st.floor - st.last - steps
         steps += 16 * ((behind + 15) // 16)
+        st.guess = 0
     elif steps <= 0 and st.has_floor and st.floor - st.last >= 16:
         behind = st.floor - st.last - delta
         steps = delta + 16 * ((behind + 15) // 16)
@@ -134,6 +144,7 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
     st.rate = rate
     synced = st.synced
     st.synced = 1
+    st.guess = 0
     if not st.has_last:
         st.has_floor = 1
         st.floor = counter
@@ -157,13 +168,31 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
         counts[RESYNCS] += 1
         counts[LOST] += ahead
         st.last += ahead
-        st.broken = 1
+        st.correction += ahead
         st.has_floor = 1
         st.floor = st.last
     elif ahead >= 0:
         st.has_floor = 1
         st.floor = st.last + ahead
     return bool(changed)
+
+
+@kernel
+def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
+    """Put right a guess after which a sample arrives earlier than any before it, by half a wrap or more."""
+    period = 1e9 / st.rate
+    offset = t_ns - int(st.last * period)
+    early = (st.offset - offset) / period
+    if st.guess > 0 and early > 8.0:
+        wraps = min(int(early / 16.0 + 0.5), st.guess)
+        st.last -= 16 * wraps
+        st.guess -= wraps
+        st.correction -= 16 * wraps
+        counts[LOST] -= 16 * wraps
+        counts[RESYNCS] += 1
+    elif st.guess == 0:
+        # A drive's clock may be slower than ours: let the earliest arrival fade.
+        st.offset = min(offset, st.offset + int((t_ns - st.last_t) * 1e-4))
 
 
 @kernel
@@ -212,6 +241,8 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.last += steps
             st.seen = (st.seen << np.uint64(steps)) | np.uint64(1) if steps < 64 else np.uint64(1)
             counts[LOST] += missing
+            if kind[k] == NIBBLE and st.rate > 0.0:
+                _before_it_was_taken(t_ns[k], st, counts)
         else:
             st.seen = np.uint64(1)
             if kind[k] == FULL:
@@ -220,11 +251,15 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             else:
                 floor = st.floor if st.has_floor else 0
                 st.last = floor + ((counter[k] - floor) & 15)
+            st.guess = 0
+            st.offset = t_ns[k] - int(st.last * (1e9 / st.rate)) if st.rate > 0.0 else 0
         gap = 0
         if st.restarted or not st.has_last:
             gap = RESTARTED if st.restarted else 0
-        elif st.broken or missing > max_gap:
-            gap = max(missing, 1)
+        elif st.correction != 0 or missing > max_gap:
+            gap = missing + st.correction
+            if gap == 0:
+                gap = 1  # the filters must restart all the same; one sample more or less is nothing
             counts[GAPS] += 1
         else:
             for j in range(1, missing + 1):
@@ -248,7 +283,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
         counts[RECEIVED] += 1
         st.has_last = 1
         st.restarted = 0
-        st.broken = 0
+        st.correction = 0
         st.last_t = t_ns[k]
         k += 1
     return m, n, _DONE

@@ -1,0 +1,50 @@
+"""The companion as the measurements on a bus run it: `python -m tools.bench.companion vcan0 [--fd]`.
+
+The same LiveRunner, Companion and port as `ipmsm-can run --transmit`, without the display.  Ends on SIGTERM and
+prints frames received, estimates sent, samples lost, kernel drops, and its own turnaround quantiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from typing import Any
+
+from ipmsm_can.bus.live import LiveRunner
+from ipmsm_can.bus.socketcan import SocketCanPort
+from ipmsm_can.companion import Companion
+from ipmsm_can.config import config_from
+from ipmsm_can.wire.protocol import Protocol
+from tools.bench.source import drive_frames
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("channel")
+    parser.add_argument("--fd", action="store_true")
+    parser.add_argument("--rate", type=float, default=5000.0)
+    args = parser.parse_args()
+    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False}})
+    warm = Companion([config], Protocol(), transmit=True)
+    warm.process(drive_frames(args.rate, 0.2, args.fd), 0)
+    companion = Companion([config], Protocol(), transmit=True)
+    stopping = False
+
+    def stop(*_: Any) -> None:
+        nonlocal stopping
+        stopping = True
+
+    signal.signal(signal.SIGTERM, stop)
+    with SocketCanPort(args.channel) as port:
+        runner = LiveRunner(port, companion, 1e6, 5e6)
+        print("ready", flush=True)
+        runner.run(lambda: stopping)
+        node = companion.nodes[0]
+        q = runner.turnaround.quantiles((0.5, 0.99, 0.999))
+        print(companion.counts.frames, node.view.estimates, node.receiver.sequencer.count("lost"), port.drops,
+              *(round(1e6 * x) for x in q), flush=True)
+
+
+if __name__ == "__main__":
+    main()
