@@ -48,7 +48,7 @@ REASON_WORDS = {
     InjectionReason.NO_SAMPLES: "no samples from the drive",
     InjectionReason.OPERATOR: "asked for by the operator",
 }
-_INJECTION_WORDS = {
+INJECTION_WORDS = {
     InjectionState.DISABLED: "disabled", InjectionState.OFF: "off", InjectionState.RAMP_UP: "rising",
     InjectionState.ON: "on", InjectionState.RAMP_DOWN: "falling", InjectionState.LIMITED: "limited",
 }
@@ -122,7 +122,7 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float) -> No
 
 def injection_words(state: InjectionState, reason: InjectionReason, amplitude: float) -> str:
     """State and reason of an injection: "on, 6.0 V: low speed"."""
-    text = _INJECTION_WORDS[state]
+    text = INJECTION_WORDS[state]
     if amplitude > 0.0:
         text += f", {amplitude:.1f} V"
     return f"{text}: {REASON_WORDS[reason]}" if REASON_WORDS[reason] else text

@@ -45,7 +45,7 @@ def losses(node: NodeStatus) -> list[tuple[str, int]]:
 def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:
     """What went wrong on the bus, in the order of the display."""
     return [("unknown ids", bus.unknown), ("wrong length", bus.wrong_length), ("remote", bus.remote),
-            ("kernel drops", bus.drops), ("unsent", bus.unsent)]
+            ("kernel drops", bus.drops)]
 
 
 def line(status: Status) -> str:
@@ -81,7 +81,7 @@ def summary(status: Status) -> str:
              f"{bus.sent} sent, load at the end {100 * bus.load:.1f} %",
              "bus: " + ", ".join(f"{name} {n}" for name, n in bus_troubles(bus)) + f"; {bus.errors}"]
     if status.transmit:
-        lines.append(f"turnaround: {turnaround(bus)}")
+        lines.append(f"answers: turnaround {turnaround(bus)}, unsent {bus.unsent}")
     for n in status.nodes:
         if not n.received:
             lines.append(f"drive {n.node} ({n.motor}): no samples came")

@@ -2,39 +2,50 @@
 
 from __future__ import annotations
 
+import textwrap
+
 from rich.text import Text
 
 from ipmsm_can.cli import plain
 from ipmsm_can.cli.status import DriveStatus, NodeStatus, RunStatus, Status
 
 _BLOCK_LINES = 8
-_FIXED_LINES = 8
 _LABEL = 9
+_ERROR_LINES = 3
 
 
 def render(status: Status, width: int, height: int) -> Text:
     """A status as at most `height` lines of at most `width` columns."""
     lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
-    for one in lines:
-        one.truncate(width)
     if len(lines) > height:
         lines = [*lines[:height - 1], Text("... the window is too low for the rest", style="yellow")]
+    for one in lines:
+        one.truncate(width)
     return Text("\n").join(lines)
 
 
 def _run(status: RunStatus, width: int, height: int) -> list[Text]:
     badge = Text(f" {plain.voice(status)} ", style="bold black on yellow" if status.transmit else "reverse")
     lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
-    whole = _FIXED_LINES + _BLOCK_LINES * len(status.nodes) <= height
-    if whole:
+    tail = _bus(status, width)
+    room = height - len(lines) - len(tail)
+    if _BLOCK_LINES * len(status.nodes) <= room:
         for node in status.nodes:
             lines += [*_node(node, width), Text()]
     else:
-        lines.append(Text(f"{'':3}{'state':10}{'angle (deg el.)':17}{'rpm (mech.)':>12}{'samples/s':>10}"
-                          f"{'lost':>7}{'bad':>5}  probing", style="dim"))
-        lines += [_row(node) for node in status.nodes]
-        lines.append(Text())
-    return lines + _bus(status)
+        lines += [*_table(status.nodes, room - 1), Text()]
+    return lines + tail
+
+
+def _table(nodes: tuple[NodeStatus, ...], room: int) -> list[Text]:
+    """One line for each drive, as many as there is room for."""
+    lines = [Text(f"{'':3}{'state':10}{'angle el.':16}{'rpm mech.':>9}{'samples/s':>10}{'lost':>6}"
+                  f"{'bad':>4}  probing", style="dim")]
+    lines += [_row(node) for node in nodes]
+    if len(lines) > room > 2:
+        hidden = len(lines) - room + 1
+        lines = [*lines[:room - 1], Text(f"   ... and {hidden} more; the window is too low", style="yellow")]
+    return lines
 
 
 def _header(title: str, badge: Text, elapsed: float, description: str, width: int) -> list[Text]:
@@ -78,8 +89,7 @@ def _node(node: NodeStatus, width: int) -> list[Text]:
              if node.live else "unknown")
     probing = Text(node.injection)
     if node.injecting:
-        probing.append("  (drive injects", style="cyan")
-        probing.append(f", {node.hf_current:.2f} A at that frequency)", style="cyan")
+        probing.append(f"  (drive injects, {node.hf_current:.2f} A)", style="cyan")
     if node.rejected_commands:
         probing.append(f"  {node.rejected_commands} commands refused", style="red")
     losses = plain.losses(node)
@@ -101,21 +111,25 @@ def _row(node: NodeStatus) -> Text:
     angle = plain.angle(node).replace("deg ", "") if node.known else "unknown"
     speed = f"{node.rpm:+.1f}" if node.live else "-"
     return Text.assemble(
-        (f"{node.node:2} ", "bold"), (f"{state:10}", _trust_style(node)), f"{angle:17}{speed:>12}"
-        f"{node.samples_per_s:>10.0f}", (f"{node.lost:>7}", "red" if node.lost else ""),
-        (f"{node.bad_frames:>5}", "red" if node.bad_frames else ""), f"  {node.injection}")
+        (f"{node.node:2} ", "bold"), (f"{state:10}", _trust_style(node)), f"{angle:16}{speed:>9}"
+        f"{node.samples_per_s:>10.0f}", (f"{node.lost:>6}", "red" if node.lost else ""),
+        (f"{node.bad_frames:>4}", "red" if node.bad_frames else ""), f"  {node.injection}")
 
 
-def _bus(status: RunStatus) -> list[Text]:
+def _bus(status: RunStatus, width: int) -> list[Text]:
     bus = status.bus
     load = (f"load {100 * bus.load:5.1f} %   {bus.frames_per_s:.0f} frames/s   received {bus.frames}   "
             f"sent {bus.sent}")
+    if bus.load > 1.0:
+        load = load.replace("%", "% (more than the bit rate carries)", 1)
     lines = [Text.assemble(("bus", "bold"), " " * (_LABEL - 1), load),
              _labelled("", _counts(plain.bus_troubles(bus)))]
     if status.transmit:
-        lines.append(_labelled("answers", f"turnaround {plain.turnaround(bus)}"))
-    lines.append(_labelled("errors", (bus.errors, "red" if bus.error_frames else "")))
-    return lines
+        unsent = _counts([("unsent", bus.unsent)])
+        lines.append(_labelled("answers", f"turnaround {plain.turnaround(bus)}  ", unsent))
+    style = "red" if bus.error_frames else ""
+    told = textwrap.wrap(bus.errors, max(20, width - _LABEL - 2)) or [""]
+    return lines + [_labelled("" if k else "errors", (part, style)) for k, part in enumerate(told[:_ERROR_LINES])]
 
 
 def _drive(status: DriveStatus, width: int) -> list[Text]:
