@@ -6,6 +6,7 @@ milliseconds out of its cache.  The first frames of a live bus must not wait for
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Sequence
 
 import numpy as np
@@ -38,6 +39,16 @@ def warm_up_companion(configs: Sequence[DriveConfig], protocol: Protocol) -> Non
                 load.update(part)
                 load.update(companion.respond(companion.feed(part), now))
             companion.bus_load = load.load(now)
+    _set_aside()
+
+
+def _set_aside() -> None:
+    """Keep what has been loaded out of the garbage collector's rounds.
+
+    A full round over the objects of numba and python-can stops the process for 0.1 s, in the middle of a run.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 def _frames(protocol: Protocol, node: int, begin: int, fd: bool) -> FrameBlock:
@@ -71,3 +82,4 @@ def warm_up_drives(drives: Sequence[DriveNode], protocol: Protocol) -> None:
             "waveform": float(Waveform.ROTATING), "amplitude": 1.0, "frequency": 400.0, "axis_angle": 0.0,
             "time_to_live": 100.0}, 0), np.zeros(1, np.int64)))
         drive.step(_STEP)
+    _set_aside()

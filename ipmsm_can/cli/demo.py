@@ -109,7 +109,6 @@ def _live(args: argparse.Namespace, setting: Setting, port: Port) -> Outcome:
     companion = Companion([config], protocol, transmit=True)
     runner = LiveRunner(port, companion, *bus.bit_rates(args, [config]))
     recorder = Recorder(companion, config.wire.node)
-    monitor = RunMonitor(runner)
 
     inside = getattr(args, "interface", None) == "virtual"
     name = "python-can's virtual bus, inside this program" if inside else port.description
@@ -125,6 +124,7 @@ def _live(args: argparse.Namespace, setting: Setting, port: Port) -> Outcome:
     went_away = ""
     drive = ThreadDrive(setting, open_port(vars(args))) if inside else ProcessDrive(setting, vars(args))
     with drive, bus.stop_on_signals(setting.duration + _SPARE_S) as stop:
+        monitor = RunMonitor(runner)
         drive.go()
         with Screen(status):
             try:

@@ -92,8 +92,8 @@ class DriveResult:
 
 def warm_up(setting: Setting) -> None:
     """Compile or load all kernels that a run needs."""
-    warm_up_companion([setting.config()], setting.protocol())
     run_in_virtual_time(Setting(setting.fd, 0, 0.1))
+    warm_up_companion([setting.config()], setting.protocol())
 
 
 def run_in_virtual_time(setting: Setting, faults: BusFaults | None = None) -> Outcome:
