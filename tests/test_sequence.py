@@ -206,6 +206,38 @@ def test_waiting_is_bounded() -> None:
     assert run.counter[-1] == n - 1
 
 
+def test_waiting_for_timing_sample_by_sample_keeps_the_newest() -> None:
+    """As on a live bus whose drive sends no DriveTiming for half a minute."""
+    n = PENDING_MAX + 1000
+    sequencer = SampleSequencer(0)
+    values = np.zeros((4, 1))
+    for k in range(n):
+        events = Events(np.zeros(1, np.int64), np.array([k & 15]), np.zeros(1), np.array([k * PERIOD_NS]), values)
+        assert sequencer.push(events) == []
+    assert sequencer.waiting
+    sender = Sender()
+    sender.timing(n - 1)
+    run = one(sequencer.push(sender.events()))
+    assert run.counter[-1] == n - 1
+    assert np.array_equal(np.diff(run.counter), np.ones(run.counter.size - 1))
+    assert PENDING_MAX <= run.counter.size <= PENDING_MAX + 256
+    assert run.counter.size + sequencer.count("overflow") == n
+    assert not sequencer.waiting
+
+
+def test_a_timing_that_cannot_be_is_counted_at_once() -> None:
+    sequencer, sender = SampleSequencer(8), Sender()
+    for rate in (0.0, 99.9, 100_001.0):
+        sender.timing(5, rate)
+    assert sequencer.push(sender.events()) == []
+    assert sequencer.count("bad_rate") == 3
+    assert not sequencer.waiting
+    sender.sample(6)
+    sender.timing(6)
+    assert one(sequencer.push(sender.events())).counter.tolist() == [6]
+    assert sequencer.count("bad_rate") == 3
+
+
 def test_configured_rate_serves_until_timing_comes() -> None:
     sequencer, sender = SampleSequencer(8, sample_rate=RATE), Sender()
     for k in range(2005, 2010):
@@ -330,7 +362,7 @@ def test_losses_of_any_length_keep_the_counter_true(first: int, steps: list[int]
     begin = 0
     while begin < len(events):
         size = cuts[begin % len(cuts)]
-        rest = events.after(begin)
+        rest = events.take(slice(begin, None))
         runs += sequencer.push(Events(rest.kind[:size], rest.counter[:size], rest.rate[:size],
                                       rest.t_ns[:size], np.ascontiguousarray(rest.values[:, :size])))
         begin += size

@@ -19,6 +19,7 @@ Everything is counted.  Samples that arrive before the sample rate is known wait
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,7 @@ LATE_AT_MOST = 64.0
 """Longest silence [samples] after which the next counter value is taken for a late sample."""
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
+_PIECES_MAX = 256
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -76,17 +78,17 @@ class Events:
     def __len__(self) -> int:
         return len(self.kind)
 
-    def after(self, begin: int) -> Events:
-        """The events from `begin` on."""
-        return Events(self.kind[begin:], self.counter[begin:], self.rate[begin:], self.t_ns[begin:],
-                      np.ascontiguousarray(self.values[:, begin:]))
+    def take(self, which: slice | NDArray[np.bool_]) -> Events:
+        """The chosen events, in order."""
+        return Events(self.kind[which], self.counter[which], self.rate[which], self.t_ns[which],
+                      np.ascontiguousarray(self.values[:, which]))
 
     @classmethod
-    def joined(cls, first: Events, second: Events) -> Events:
-        """Both, one after the other."""
-        return cls(np.concatenate([first.kind, second.kind]), np.concatenate([first.counter, second.counter]),
-                   np.concatenate([first.rate, second.rate]), np.concatenate([first.t_ns, second.t_ns]),
-                   np.concatenate([first.values, second.values], axis=1))
+    def joined(cls, parts: Sequence[Events]) -> Events:
+        """All of them, one after the other; at least one."""
+        return cls(np.concatenate([p.kind for p in parts]), np.concatenate([p.counter for p in parts]),
+                   np.concatenate([p.rate for p in parts]), np.concatenate([p.t_ns for p in parts]),
+                   np.concatenate([p.values for p in parts], axis=1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,7 +304,7 @@ class SampleSequencer:
         self.counts = np.zeros(len(COUNTERS), np.int64)
         self._fallback_rate = sample_rate
         self._state = np.zeros(1, STATE)
-        self._pending: Events | None = None
+        self._pending: list[Events] = []
 
     def count(self, name: str) -> int:
         """One of COUNTERS."""
@@ -316,7 +318,7 @@ class SampleSequencer:
     @property
     def waiting(self) -> bool:
         """True while samples have come but no sample rate."""
-        return self._pending is not None
+        return any(map(len, self._pending))
 
     def push(self, events: Events) -> list[SampleRun]:
         """Take in events; returns the samples they complete, in runs of one sample rate each."""
@@ -325,21 +327,36 @@ class SampleSequencer:
         if self.sample_rate == 0.0 and self._fallback_rate is not None:
             self._state["rate"] = self._fallback_rate
         if self.sample_rate == 0.0:
-            if self._pending is not None:
-                events = Events.joined(self._pending, events)
-            believed = (events.rate >= RATE_MIN) & (events.rate <= RATE_MAX)
-            timings = np.flatnonzero((events.kind == TIMING) & believed)
-            if timings.size:
-                self._pending = None
-                self._synchronise(events, int(timings[0]))
-            else:
-                over = len(events) - PENDING_MAX
-                if over > 0:
-                    self.counts[OVERFLOW] += over
-                    events = events.after(over)
-                self._pending = events
+            events = self._believed(events)
+            self._pending.append(events)
+            timings = np.flatnonzero(events.kind == TIMING)
+            if not timings.size:
+                self._bound()
                 return []
+            before = sum(map(len, self._pending)) - len(events)
+            events = Events.joined(self._pending)
+            self._pending = []
+            self._synchronise(events, before + int(timings[0]))
         return self._run(events)
+
+    def _believed(self, events: Events) -> Events:
+        """Without the timings that cannot be; they would make a drive without samples look as if it had some."""
+        wrong = (events.kind == TIMING) & ~((events.rate >= RATE_MIN) & (events.rate <= RATE_MAX))
+        if not wrong.any():
+            return events
+        self.counts[BAD_RATE] += int(wrong.sum())
+        return events.take(~wrong)
+
+    def _bound(self) -> None:
+        """Keep the newest PENDING_MAX events, in few pieces; seldom, as it copies them all."""
+        over = sum(map(len, self._pending)) - PENDING_MAX
+        if len(self._pending) <= _PIECES_MAX and over < _PIECES_MAX:
+            return
+        together = Events.joined(self._pending)
+        if over > 0:
+            self.counts[OVERFLOW] += over
+            together = together.take(slice(over, None))
+        self._pending = [together]
 
     def _synchronise(self, events: Events, timing: int) -> None:
         """Give the samples before the first DriveTiming the counters they must have had."""
@@ -348,8 +365,7 @@ class SampleSequencer:
         nibbles = np.flatnonzero(kinds == NIBBLE)
         if not nibbles.size or (kinds == FULL).any():
             return
-        before = Events(events.kind[:timing], events.counter[:timing], events.rate[:timing],
-                        events.t_ns[:timing], np.ascontiguousarray(events.values[:, :timing]))
+        before = events.take(slice(0, timing))
         trial = SampleSequencer(0)
         trial._state["rate"] = self._state["rate"]
         runs = trial._run(before)
