@@ -37,8 +37,9 @@ RESTARTED = 1 << 40
 """Value of `gap` at the first sample after the drive restarted: nothing before it counts."""
 LONGEST_SILENCE = 60.0
 """A counter further ahead than this [s] is a restarted drive, not a gap."""
-LATE_AT_MOST = 64.0
-"""Longest silence [samples] after which the next counter value is taken for a late sample."""
+LATE_AT_MOST = 0.1
+"""Longest silence [s] after which the next counter value is taken for a late sample: so long may a busy
+computer hold up a sender; it costs no more than waiting for the next DriveTiming when samples were lost."""
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
 _PIECES_MAX = 256
@@ -117,7 +118,7 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
         expected = (t_ns - st.last_t) * 1e-9 * st.rate
         # A clock that was set back says nothing; believed, it would make every sample that follows "late".
         expected = min(max(expected, 0.0), 1e9)
-        if delta == 1 and expected <= LATE_AT_MOST:
+        if delta == 1 and expected <= LATE_AT_MOST * st.rate:
             # Exactly the next one: late rather than exactly 16, 32, ... lost.
             steps = 1
         else:
