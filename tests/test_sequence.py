@@ -226,6 +226,21 @@ def test_waiting_for_timing_sample_by_sample_keeps_the_newest() -> None:
     assert not sequencer.waiting
 
 
+def test_the_first_timing_may_be_overtaken_by_samples() -> None:
+    """DriveSample has the higher priority: up to three of them may go before an older DriveTiming."""
+    for overtaken in range(4):
+        for rate in (None, RATE):
+            sequencer, sender = SampleSequencer(8, sample_rate=rate), Sender()
+            for k in range(4000, 4010):
+                sender.sample(k)
+            sender.timing(4009 - overtaken, t_ns=4009 * PERIOD_NS)
+            sender.sample(4010)
+            counters = np.concatenate([r.counter for r in sequencer.push(sender.events())]).tolist()
+            assert counters[-1] == 4010
+            assert rate or counters == list(range(4000, 4011))
+            assert sequencer.count("lost") == 0
+
+
 def test_a_timing_that_cannot_be_is_counted_at_once() -> None:
     sequencer, sender = SampleSequencer(8), Sender()
     for rate in (0.0, 99.9, 100_001.0):

@@ -40,6 +40,8 @@ LONGEST_SILENCE = 60.0
 LATE_AT_MOST = 0.1
 """Longest silence [s] after which the next counter value is taken for a late sample: so long may a busy
 computer hold up a sender; it costs no more than waiting for the next DriveTiming when samples were lost."""
+TIMING_LATE_AT_MOST = 3
+"""Samples that may overtake a DriveTiming on their way."""
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
 _PIECES_MAX = 256
@@ -141,6 +143,16 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
 
 
 @kernel
+def _settled(last: int, sent: int) -> int:
+    """The counter that ends in the low four bits of `last`, given that sample `sent` had just been sent.
+
+    The samples may lag behind through loss; and DriveTiming, of lower priority, may lag a little itself.
+    """
+    ahead = (last - sent) & 15
+    return sent + (ahead if ahead <= TIMING_LATE_AT_MOST else ahead - 16)
+
+
+@kernel
 def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
     """Take in a DriveTiming; True where the sample rate changed."""
     changed = rate != st.rate
@@ -154,7 +166,7 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
         return bool(changed)
     if not synced and not changed:
         # Counters were relative until now; the samples themselves are unbroken.
-        st.last = counter - ((counter - st.last) & 15)
+        st.last = _settled(st.last, counter)
         st.has_floor = 1
         st.floor = counter
         return bool(changed)
@@ -375,7 +387,7 @@ class SampleSequencer:
         first = int(runs[0].counter[0])
         last = int(runs[-1].counter[-1])
         sent = int(events.counter[timing])
-        settled = sent - ((sent - last) & 15)
+        settled = _settled(last, sent)
         self._state["has_floor"] = 1
         self._state["floor"] = (settled - last + first) % _WRAP
 
