@@ -41,8 +41,11 @@ class Port(Protocol):
     def unsent(self) -> int:
         """Frames given to `send` that the interface would not take in time."""
 
-    def receive(self, timeout_s: float) -> FrameBlock:
+    def receive(self, timeout_s: float, expect: int = 1) -> FrameBlock:
         """Wait for a frame, at most timeout_s (0 does not wait), then take all there are, up to a maximum.
+
+        With expect > 1 it waits for that many, at most timeout_s for each, and takes no more: a reader that
+        knows when it will have something to do is not woken before.
 
         With expect > 1 it waits for that many, at most timeout_s for each, and takes no more: a reader that
         knows when it will have something to do is not woken before.

@@ -54,11 +54,11 @@ def loop(channel: str) -> int:
 
     from ipmsm_can.wire.dbc import default_dbc_path
 
-    database = cantools.database.load_file(str(default_dbc_path()))
+    database: Any = cantools.database.load_file(str(default_dbc_path()))
     sample = database.get_message_by_name("DriveSample")
     answer = database.get_message_by_name("PositionEstimate")
     bus = can.Bus(interface="socketcan", channel=channel)
-    values = {name: 0 for name in (s.name for s in answer.signals)}
+    values = dict.fromkeys((s.name for s in answer.signals), 0)
     received = 0
     print("ready", flush=True)
     try:
