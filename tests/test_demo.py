@@ -21,7 +21,9 @@ from ipmsm_can.wire.protocol import MessageKind
 def test_fast_demo_locks_and_shows_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "folder"
     assert main(["demo", "--fast", "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) <= max(80, len(f"  plot: {out}/demo.html and {out}/demo.png"))
+    said = " ".join(printed.split())
     assert "in virtual time" in said and "All well" in said
     lock = re.search(r"first valid angle \.+ ([\d.]+) s after the first sample, ([\d.]+) s after the rotor", said)
     error = re.search(r"error once valid \.+ ([\d.]+) deg rms, ([\d.]+) deg", said)

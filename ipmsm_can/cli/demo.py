@@ -90,7 +90,7 @@ def choose_bus(args: argparse.Namespace) -> Port:
             return open_port(vars(args))
         except BusError as error:
             print(f"vcan0 cannot be used: {error}.", file=sys.stderr)
-    args.interface, args.channel = "virtual", f"ipmsm-can-demo-{id(args):x}"
+    args.interface, args.channel = "virtual", "ipmsm-can-demo"
     return open_port(vars(args))
 
 
@@ -117,8 +117,8 @@ def _live(args: argparse.Namespace, setting: Setting, port: Port) -> Outcome:
 
     def status() -> RunStatus:
         off = math.degrees(recorder.latest_error)
-        monitor.title = (f"ipmsm-can demo  {recorder.seconds:.0f} of {setting.duration:g} s, "
-                         f"off by {off:+.2f}° from the encoder" if math.isfinite(off) else "ipmsm-can demo")
+        known = f", off by {off:+.2f}°" if math.isfinite(off) else ""
+        monitor.title = f"ipmsm-can demo {recorder.seconds:.0f}/{setting.duration:g} s{known}"
         return monitor.status()
 
     went_away = ""

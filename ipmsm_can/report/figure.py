@@ -192,7 +192,7 @@ def _speed(record: Record, c: Comparison, motor: Motor, end: float, phases: tupl
              Line(record.time, record.omega * rpm, "estimate", "estimate from currents and voltages"))
     top = float(np.abs(c.omega_encoder * rpm).max(initial=20.0))
     scale = _symmetric(tuple(v for v in (20.0, 100.0, 1000.0, 10_000.0) if v <= 1.05 * top), 15.0)
-    scale = replace(scale, low=-5.0 * top, high=1.3 * top)  # room for the load bars
+    scale = replace(scale, low=-9.0 * top, high=1.3 * top)  # room for the load bars
     return Panel("speed", "What the motor did",
                  "Speed of the shaft, on a scale that is fine around 0, so that 20 rpm shows beside 1000. "
                  "The bars at the bottom are load torque stepped on and off.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ LARGEST_VALID_ERROR = 15.0
 LARGEST_VALID_RMS = 2.0
 """Likewise for the rms error [deg electrical] of valid angles."""
 QUANTILES = (0.5, 0.99, 0.999)
+_COLUMNS = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,7 +229,8 @@ def rows(s: Summary) -> list[tuple[str, str]]:
 
 def text(s: Summary) -> str:
     """The summary for a terminal."""
-    lines = [f"  {what + ' ':.<29} {figure}" for what, figure in rows(s)]
+    lines = [textwrap.fill(f"  {what + ' ':.<29} {figure}", _COLUMNS, subsequent_indent=" " * 32,
+                           break_long_words=False) for what, figure in rows(s)]
     lines.append("  frames:")
     for kind, n in s.frames.items():
         if n:
