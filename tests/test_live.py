@@ -5,6 +5,7 @@ Everything here runs in real time on whatever machine there is: asserted is what
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import subprocess
@@ -21,10 +22,13 @@ import cantools
 import numpy as np
 import pytest
 
+from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.port import BusError, open_port
 from ipmsm_can.bus.warmup import warm_up_companion, warm_up_drives
 from ipmsm_can.cli import bus, main
-from ipmsm_can.cli.drive import build_drives
+from ipmsm_can.cli.drive import build_drives, read_profile
+from ipmsm_can.cli.monitor import RunMonitor
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import parse_config
 from ipmsm_can.config.build import build_protocol
 from ipmsm_can.drive.profile import demo
@@ -339,8 +343,6 @@ def test_a_second_look_at_the_clock_ends_a_run() -> None:
 
 
 def test_opening_asks_for_can_fd_where_a_drive_needs_it() -> None:
-    import argparse
-
     args = argparse.Namespace(interface="virtual", channel="asks")
     with bus.open_bus(args) as port:
         assert not port.fd
@@ -348,3 +350,33 @@ def test_opening_asks_for_can_fd_where_a_drive_needs_it() -> None:
         assert port.fd
     with open_port({"interface": "virtual", "channel": "asks"}) as port:
         assert not port.fd
+
+
+def test_a_drive_that_fell_silent_has_no_valid_angle_on_the_screen(steady: str) -> None:
+    configs = (parse_config(M2),)
+    protocol = build_protocol(configs)
+    drive, = build_drives(configs, protocol, read_profile(steady))
+    with bus.open_bus(argparse.Namespace(interface="virtual", channel="stale")) as port:
+        runner = LiveRunner(port, Companion(configs, protocol, transmit=True), 1e6, 5e6)
+        monitor = RunMonitor(runner)
+        runner.companion.process(drive.step(10_000).frames, 2_000_000_000)
+        runner.companion.process(FrameBlock.zeros(0), 2_010_000_000)
+        before, = monitor.status().nodes
+        runner.companion.process(FrameBlock.zeros(0), 2_500_000_000)
+        after, = monitor.status().nodes
+    assert (before.live, before.valid, before.trust) == (True, True, "VALID")
+    assert before.rpm == pytest.approx(600.0, abs=1.0)
+    assert before.received == 10_000
+    assert (after.live, after.valid, after.locked, after.polarity_known) == (False, False, False, False)
+    assert (after.trust, after.state) == ("no estimate", "no samples any more")
+
+
+def test_drives_start_where_they_are_told_and_each_has_noise_of_its_own(steady: str) -> None:
+    configs = tuple(parse_config(f"{M2}[wire]\nnode = {k}\n") for k in range(2))
+    protocol = build_protocol(configs)
+    runs = [[d.step(20).samples for d in build_drives(configs, protocol, read_profile(steady), 1.25, seed)]
+            for seed in (0, 7, 7)]
+    assert [drive.theta_e[0] for run in runs for drive in run] == pytest.approx([1.25] * 6)
+    assert not np.array_equal(runs[0][0].i_alpha, runs[0][1].i_alpha)
+    assert not np.array_equal(runs[0][0].i_alpha, runs[1][0].i_alpha)
+    assert np.array_equal(runs[1][1].i_alpha, runs[2][1].i_alpha)
