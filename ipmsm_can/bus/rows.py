@@ -233,6 +233,12 @@ def format_rows(sample: NDArray[np.int64], filled: Bytes, time_s: Floats, theta:
     return at
 
 
+def warm_up() -> None:
+    """Compile or load the kernel behind CSV before there is anything to measure."""
+    whole, real, flag = np.zeros(1, np.int64), np.zeros(1), np.zeros(1, np.uint8)
+    format_rows(whole, flag, real, real, real, flag, flag, flag, real, real, real, np.empty(_ROW_BYTES, np.uint8))
+
+
 class CsvRows:
     """CSV with a header line; floats with ten significant digits, seconds to the nanosecond, flags 0 or 1.
 

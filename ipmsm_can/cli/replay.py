@@ -139,7 +139,8 @@ def _protocol(configs: Sequence[DriveConfig]) -> Protocol:
 class Session:
     """One replay with its files and its clock.
 
-    compute_s: time spent on everything but reading the log [s]; read_s: on that.
+    compute_s: time spent on everything but reading the log [s], writing rows included; read_s: on that.
+    Neither holds the loading of compiled kernels, or their compilation on the first run ever.
     """
 
     def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, paths: dict[int, Path]) -> None:
@@ -161,7 +162,11 @@ class Session:
     def run(self, blocks: Any) -> None:
         """Replay all blocks; files are complete afterwards, whatever happens."""
         from ipmsm_can.bus.replay import Replay, prepare
+        from ipmsm_can.bus.rows import warm_up
+        from ipmsm_can.bus.warmup import warm_up_companion
 
+        warm_up_companion(self._configs, self._protocol)
+        warm_up()
         begin = time.monotonic()
         configs, source = prepare(self._configs, self._protocol, blocks)
         self.replay = Replay(configs, self._protocol, self._write if self._paths else None)
