@@ -37,7 +37,7 @@ RESTARTED = 1 << 40
 """Value of `gap` at the first sample after the drive restarted: nothing before it counts."""
 LONGEST_SILENCE = 60.0
 """A counter further ahead than this [s] is a restarted drive, not a gap."""
-LATE_AT_MOST = 0.1
+LATE_AT_MOST = 0.5
 """Longest silence [s] after which the next counter value is taken for a late sample: so long may a busy
 computer hold up a sender; it costs no more than waiting for the next DriveTiming when samples were lost."""
 TIMING_LATE_AT_MOST = 3
