@@ -108,6 +108,9 @@ def test_plain_line_and_summary() -> None:
     assert "turnaround" not in text
     assert "answers: turnaround p50 120 us" in plain.summary(replace(STATUS, transmit=True))
     assert "drive 3 (m2): no samples came" in plain.summary(replace(STATUS, nodes=(replace(NODE, received=0),)))
+    assert text.endswith("  last: locked, VALID, 330.0 deg +/- 0.6, +1000.1 rpm")
+    silent = replace(STATUS, nodes=(replace(NODE, live=False, state="no samples any more"),))
+    assert plain.summary(silent).endswith("  last: no samples any more")
     assert plain.summary(DRIVE) == ("1000 frames sent in 3.0 s, 2 unsent; this machine was too slow for real time "
                                     "1 times; drive 0 refused 4 commands")
 
