@@ -88,5 +88,6 @@ def summary(status: Status) -> str:
             continue
         lines.append(f"drive {n.node} ({n.motor}): {n.received} samples, "
                      + ", ".join(f"{name} {count}" for name, count in losses(n)))
-        lines.append(f"  last: {n.state}" + (f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm" if n.live else ""))
+        known = f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm" if n.live else ""
+        lines.append(f"  last: {n.state}{known}")
     return "\n".join(lines)
