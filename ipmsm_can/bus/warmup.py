@@ -57,19 +57,20 @@ def _frames(protocol: Protocol, node: int, begin: int, fd: bool) -> FrameBlock:
     turn = 0.06 * k
     values = {"i_alpha": np.cos(turn), "i_beta": np.sin(turn), "v_alpha": 100 * np.cos(turn),
               "v_beta": 100 * np.sin(turn)}
-    first, one = np.array([begin]), np.ones(1)
-    parts = [protocol.encode(MessageKind.DRIVE_TIMING, node, {"sample_counter": first, "sample_rate": _RATE * one}),
-             protocol.encode(MessageKind.DRIVE_STATUS, node, {"mode": one, "v_dc": 300 * one}),
-             protocol.encode(MessageKind.DRIVE_REFERENCE, node, {"sample_counter": first})]
+    last, one = k[-1:], np.ones(1)
+    others = [
+        protocol.encode(MessageKind.DRIVE_TIMING, node, {"sample_counter": last, "sample_rate": _RATE * one}),
+        protocol.encode(MessageKind.DRIVE_STATUS, node, {"mode": one, "v_dc": 300 * one}),
+        protocol.encode(MessageKind.DRIVE_REFERENCE, node, {"sample_counter": last})]
     if fd:
         starts = k[::BLOCK_SAMPLES]
         blocks = {f"{axis}_{j}": v[j::BLOCK_SAMPLES] for axis, v in values.items() for j in range(BLOCK_SAMPLES)}
-        parts.append(protocol.encode(MessageKind.DRIVE_SAMPLE_BLOCK, node, {
+        samples = protocol.encode(MessageKind.DRIVE_SAMPLE_BLOCK, node, {
             **blocks, "first_sample": starts, "sample_count": np.full(starts.size, BLOCK_SAMPLES)},
-            starts // BLOCK_SAMPLES))
+            starts // BLOCK_SAMPLES)
     else:
-        parts.append(protocol.encode(MessageKind.DRIVE_SAMPLE, node, {**values, "sample_counter": k & 15}))
-    raw = np.concatenate(parts)
+        samples = protocol.encode(MessageKind.DRIVE_SAMPLE, node, {**values, "sample_counter": k & 15})
+    raw = np.concatenate([samples, *others])  # samples before the first DriveTiming: those have to wait for it
     # as if all had just arrived: what was sent first may be a tenth of a second old by now
     return FrameBlock(raw, np.full(raw.shape[0], round(1e9 * (begin + _STEP) / _RATE), np.int64))
 
