@@ -160,6 +160,8 @@ class Node:
             frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
             self._meter = meter.new_state(frequency, run.sample_rate)
         estimate = estimator.process(run.values, run.gap)
+        if run.doubt.any():
+            estimate.flags[run.doubt != 0] &= 0xFF ^ confidence.VALID
         view = self.view
         view.hf_current = meter.meter_block(run.values, self._meter)
         view.sample = int(run.counter[-1])

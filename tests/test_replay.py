@@ -186,7 +186,7 @@ def run_of(counter: list[int], gap: list[int] | None = None, t_ms: list[float] |
     n = len(counter)
     t = np.array(t_ms if t_ms is not None else [float(c) for c in counter]) * 1e6
     return SampleRun(rate, np.array(counter, np.int64), np.zeros((4, n)), np.zeros(n, np.uint8),
-                     np.array(gap or [0] * n, np.int64), t.astype(np.int64))
+                     np.zeros(n, np.uint8), np.array(gap or [0] * n, np.int64), t.astype(np.int64))
 
 
 def test_clock_counts_samples_not_arrivals() -> None:
@@ -217,14 +217,14 @@ def test_clock_bridges_restart_rate_change_and_setting_back_by_arrival() -> None
 def test_clock_does_not_depend_on_blocks(steps: list[int], cuts: set[int]) -> None:
     counter = np.cumsum(steps).astype(np.int64)
     gap = np.array(steps, np.int64) - 1
-    run = SampleRun(7000.0, counter, np.zeros((4, counter.size)), np.zeros(counter.size, np.uint8), gap,
-                    counter * 142857)
+    nothing = np.zeros(counter.size, np.uint8)
+    run = SampleRun(7000.0, counter, np.zeros((4, counter.size)), nothing, nothing, gap, counter * 142857)
     whole = SampleClock().times(run)
     clock, parts = SampleClock(), []
     edges = [0, *sorted(c for c in cuts if c < counter.size), counter.size]
     for a, b in pairwise(edges):
-        parts.append(clock.times(SampleRun(7000.0, counter[a:b], run.values[:, a:b], run.filled[a:b], gap[a:b],
-                                           run.t_ns[a:b])))
+        parts.append(clock.times(SampleRun(7000.0, counter[a:b], run.values[:, a:b], run.filled[a:b], run.doubt[a:b],
+                                           gap[a:b], run.t_ns[a:b])))
     assert np.array_equal(whole, np.concatenate(parts))
     assert (np.diff(whole) > 0).all()
     assert np.allclose(whole, (counter - counter[0]) / 7000.0)

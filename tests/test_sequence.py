@@ -121,7 +121,7 @@ def test_loss_of_whole_wraps_looks_like_a_stall_until_the_next_timing() -> None:
     sender.sample(1034)
     run = one(sequencer.push(sender.events()))
     assert run.counter.tolist() == [1034]
-    assert run.gap.tolist() == [32]
+    assert run.gap.tolist() == [-32]
     assert sequencer.count("lost") == 32
 
 

@@ -121,8 +121,8 @@ class Estimator:
         samples: float64 (4, N), C-contiguous: i_alpha, i_beta [A peak], v_alpha, v_beta [V peak, mean of the
         interval that ended at the sample].
         gap: int64 (N,), number of samples missing right before each one, or None for none at all; a gap
-        restarts the filters and carries flux and angle over it with the last speed.  Negative: an earlier gap
-        had been given too long by so much.
+        restarts the filters and carries flux and angle over it with the last speed.  Negative: the samples
+        before turn out to have been dated wrong by so many; angle and speed are kept, but doubted.
         """
         n = samples.shape[1]
         out = EstimateBlock.empty(n)
@@ -154,7 +154,7 @@ class Estimator:
     def _restart(self, missing: int, first: Floats) -> None:
         """Start the filters anew before the sample `first` (4,), `missing` samples after the last one."""
         s = self.settings
-        elapsed = (missing + 1) / self.sample_rate
+        elapsed = (max(missing, 0) + 1) / self.sample_rate
         self._regression[:] = np.zeros(1, regression.STATE)
         old = self._observer[0]
         fresh = np.zeros(1, ges.STATE)
@@ -176,7 +176,11 @@ class Estimator:
             fresh["lambda_b"] = size * math.sin(angle) + self.motor.L_q * first[1]
             one_step_back = angle - float(pll["omega"][0]) / self.sample_rate
             pll["theta"] = pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
-            doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
+            if missing < 0:
+                # What was taken for one stretch of time was two, or the other way round.
+                doubt = size * min(abs(missing * float(pll["omega"][0])) / self.sample_rate, math.pi)
+            else:
+                doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
             drift = s.voltage_uncertainty * elapsed
             confidence.widen(self._confidence, doubt**2 + drift**2)
         self._observer = fresh

@@ -45,6 +45,8 @@ TIMING_LATE_AT_MOST = 3
 PENDING_MAX = 1 << 17
 """Events kept while the sample rate is unknown."""
 _PIECES_MAX = 256
+HALF_WRAP = 8.0
+"""Half a wrap of the 4-bit counter [samples]: how far the arrival time can be off and still tell wraps apart."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -52,7 +54,7 @@ Ints = NDArray[np.int64]
 STATE = np.dtype([
     ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
     ("rate", "f8"), ("synced", "i8"), ("guess", "i8"), ("offset", "i8"), ("restarted", "i8"),
-    ("correction", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
+    ("correction", "i8"), ("doubt", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
 ])
 
 RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
@@ -100,7 +102,10 @@ class SampleRun:
 
     sample_rate [Hz].  counter (M,) int64: the drive's 32-bit counter.  values (4, M), C-contiguous.
     filled (M,) uint8: 1 where interpolated.  gap (M,) int64: samples missing right before this one (0 where
-    none, RESTARTED after a restart of the drive, negative where an earlier gap had been taken for too long).
+    none, RESTARTED after a restart of the drive; negative where the samples before it turn out to have been
+    dated wrong, by so many samples).
+    doubt (M,) uint8: 1 while the counter, so the time, may be wrong by whole wraps: after a silence that could be
+    loss or lateness, until DriveTiming or the pace of arrival settles it.
     t_ns (M,) int64: arrival of the frame (filled: of the frame that closed the gap).
     """
 
@@ -108,6 +113,7 @@ class SampleRun:
     counter: Ints
     values: Floats
     filled: NDArray[np.uint8]
+    doubt: NDArray[np.uint8]
     gap: Ints
     t_ns: Ints
 
@@ -116,29 +122,24 @@ class SampleRun:
 def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
     """How many samples lie between the last one and this 4-bit counter; 0 duplicate, negative late."""
     delta = (nibble - st.last) & 15
-    if st.rate > 0.0:
-        expected = (t_ns - st.last_t) * 1e-9 * st.rate
-        # A clock that was set back says nothing; believed, it would make every sample that follows "late".
-        expected = min(max(expected, 0.0), 1e9)
-        if delta == 1 and expected <= LATE_AT_MOST * st.rate:
-            # Exactly the next one: late rather than exactly 16, 32, ... lost.
-            steps = 1
-        else:
-            steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
-            if steps > 16:
-                st.guess += (steps - 1) // 16
-    else:
-        steps = int(delta if delta <= 8 else delta - 16)
-    if steps < -15:
-        steps = delta - 16 if delta else 0
-    if steps > 0 and st.has_floor and st.last + steps < st.floor:
-        # DriveTiming said that `floor` had been sent before this frame: whole wraps are missing.
-        behind = st.floor - st.last - steps
-        steps += 16 * ((behind + 15) // 16)
-        st.guess = 0
-    elif steps <= 0 and st.has_floor and st.floor - st.last >= 16:
-        behind = st.floor - st.last - delta
-        steps = delta + 16 * ((behind + 15) // 16)
+    # DriveTiming said that `floor` had been sent before this frame: so many steps at least.
+    least = st.floor - st.last if st.has_floor else 0
+    proven = delta + 16 * max((least - delta + 15) // 16, 0)
+    if st.rate <= 0.0:
+        return int(delta if delta <= 8 else delta - 16)
+    # A clock that was set back says nothing; believed, it would make every sample that follows "late".
+    expected = min(max((t_ns - st.last_t) * 1e-9 * st.rate, 0.0), 1e9)
+    if delta == 1 and least <= 1 and expected <= LATE_AT_MOST * st.rate:
+        # Exactly the next one: late rather than exactly 16, 32, ... lost.
+        if expected - delta > HALF_WRAP:
+            st.doubt = st.synced
+        return 1
+    steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
+    if steps < proven and (steps > 0 or least >= 16):
+        steps = proven
+    if steps >= proven + 16 and steps > 16:
+        st.guess += (steps - max(proven, 1)) // 16
+        st.doubt = st.synced
     return int(steps)
 
 
@@ -160,6 +161,8 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
     synced = st.synced
     st.synced = 1
     st.guess = 0
+    doubted = st.doubt
+    st.doubt = 0
     if not st.has_last:
         st.has_floor = 1
         st.floor = counter
@@ -179,11 +182,12 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
         st.restarted = 1
         st.has_floor = 1
         st.floor = counter
-    elif ahead < 0 and (ahead & 15) == 0:
+    elif (doubted and _settled(st.last, counter) != st.last) or (ahead < 0 and (ahead & 15) == 0):
+        wrong_by = _settled(st.last, counter) - st.last
         counts[RESYNCS] += 1
-        counts[LOST] += ahead
-        st.last += ahead
-        st.correction += ahead
+        counts[LOST] += wrong_by
+        st.last += wrong_by
+        st.correction += wrong_by
         st.has_floor = 1
         st.floor = st.last
     elif ahead >= 0:
@@ -198,7 +202,7 @@ def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
     period = 1e9 / st.rate
     offset = t_ns - int(st.last * period)
     early = (st.offset - offset) / period
-    if st.guess > 0 and early > 8.0:
+    if st.guess > 0 and early > HALF_WRAP:
         wraps = min(int(early / 16.0 + 0.5), st.guess)
         st.last -= 16 * wraps
         st.guess -= wraps
@@ -206,6 +210,8 @@ def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
         counts[LOST] -= 16 * wraps
         counts[RESYNCS] += 1
     elif st.guess == 0:
+        if early > -HALF_WRAP:
+            st.doubt = 0  # as prompt as ever: it was late, and nothing is missing
         # A drive's clock may be slower than ours: let the earliest arrival fade.
         st.offset = min(offset, st.offset + int((t_ns - st.last_t) * 1e-4))
 
@@ -213,7 +219,8 @@ def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
 @kernel
 def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, values: Floats,
              max_gap: int, st_array: NDArray[np.void], counts: Ints, out_counter: Ints, out_values: Floats,
-             out_filled: NDArray[np.uint8], out_gap: Ints, out_t: Ints) -> tuple[int, int, int]:
+             out_filled: NDArray[np.uint8], out_doubt: NDArray[np.uint8], out_gap: Ints,
+             out_t: Ints) -> tuple[int, int, int]:
     """Sequence events from `begin` on; stops after a change of sample rate.
 
     Returns (number of samples put out, next event, _DONE or _RATE_CHANGED).  The outputs need room for
@@ -235,6 +242,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             if kind[k] == NIBBLE:
                 steps = _steps_since_last(counter[k], t_ns[k], st)
             else:
+                st.doubt = 0
                 steps = (counter[k] - st.last) & (_WRAP - 1)
                 if steps >= _WRAP // 2:
                     steps -= _WRAP
@@ -267,14 +275,15 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                 floor = st.floor if st.has_floor else 0
                 st.last = floor + ((counter[k] - floor) & 15)
             st.guess = 0
+            st.doubt = 0
             st.offset = t_ns[k] - int(st.last * (1e9 / st.rate)) if st.rate > 0.0 else 0
         gap = 0
         if st.restarted or not st.has_last:
             gap = RESTARTED if st.restarted else 0
         elif st.correction != 0 or missing > max_gap:
-            gap = missing + st.correction
-            if gap == 0:
-                gap = 1  # the filters must restart all the same; one sample more or less is nothing
+            gap = missing
+            if st.correction != 0:
+                gap = -max(abs(st.correction), missing)
             counts[GAPS] += 1
         else:
             for j in range(1, missing + 1):
@@ -283,6 +292,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                     out_values[r, m] = st.values[r] + weight * (values[r, k] - st.values[r])
                 out_counter[m] = (st.last - missing - 1 + j) & (_WRAP - 1)
                 out_filled[m] = 1
+                out_doubt[m] = st.doubt
                 out_gap[m] = 0
                 out_t[m] = t_ns[k]
                 m += 1
@@ -292,6 +302,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.values[r] = values[r, k]
         out_counter[m] = st.last & (_WRAP - 1)
         out_filled[m] = 0
+        out_doubt[m] = st.doubt
         out_gap[m] = gap
         out_t[m] = t_ns[k]
         m += 1
@@ -400,14 +411,15 @@ class SampleSequencer:
             counter = np.empty(room, np.int64)
             values = np.empty((4, room))
             filled = np.empty(room, np.uint8)
+            doubt = np.empty(room, np.uint8)
             gap = np.empty(room, np.int64)
             t_ns = np.empty(room, np.int64)
             m, begin, why = sequence(begin, events.kind, events.counter, events.rate, events.t_ns,
                                      events.values, self.max_gap, self._state, self.counts,
-                                     counter, values, filled, gap, t_ns)
+                                     counter, values, filled, doubt, gap, t_ns)
             if m:
                 runs.append(SampleRun(rate, counter[:m], np.ascontiguousarray(values[:, :m]), filled[:m],
-                                      gap[:m], t_ns[:m]))
+                                      doubt[:m], gap[:m], t_ns[:m]))
             if why == _DONE:
                 break
         return runs
