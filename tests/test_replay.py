@@ -223,8 +223,8 @@ def test_clock_does_not_depend_on_blocks(steps: list[int], cuts: set[int]) -> No
     clock, parts = SampleClock(), []
     edges = [0, *sorted(c for c in cuts if c < counter.size), counter.size]
     for a, b in pairwise(edges):
-        parts.append(clock.times(SampleRun(7000.0, counter[a:b], run.values[:, a:b], run.filled[a:b], run.doubt[a:b],
-                                           gap[a:b], run.t_ns[a:b])))
+        parts.append(clock.times(SampleRun(7000.0, counter[a:b], run.values[:, a:b], run.filled[a:b],
+                                           run.doubt[a:b], gap[a:b], run.t_ns[a:b])))
     assert np.array_equal(whole, np.concatenate(parts))
     assert (np.diff(whole) > 0).all()
     assert np.allclose(whole, (counter - counter[0]) / 7000.0)
