@@ -2,22 +2,19 @@
 
 `tools/vcan/run .venv/bin/python -m tools.bench.on_bus [--seconds 10]`.  Each subject runs as a process of its own
 against the same traffic, one after the other; a recorder takes the kernel's time stamps of samples and
-answers, so nobody measures itself.  CPU is what a process at idle priority could not have while the subject ran,
-less the same without a subject (see tools/bench/soaker.py); everything is held on one processor for it.
+answers, so nobody measures itself.  Where the kernel counts CPU time by the tick, marks are printed instead, and
+`python -m tools.bench`, outside, works out the CPU time from them (see tools/bench/cpu.py); traffic without a
+subject before and after each one is what is taken off.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,34 +22,10 @@ from numpy.typing import NDArray
 from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.wire.protocol import MessageKind, Protocol
+from tools.bench import cpu
 
-
-class Soaker:
-    """Counts what idle priority gets of the processor that everything runs on."""
-
-    def __init__(self) -> None:
-        self._file = tempfile.NamedTemporaryFile()  # noqa: SIM115 - lives as long as the soaker
-        self._file.write(bytes(8))
-        self._file.flush()
-        self._process = _start(["tools.bench.soaker", self._file.name])
-        time.sleep(0.5)
-        self.full = self.rate(2.0)
-
-    def count(self) -> int:
-        """The count so far."""
-        return int(struct.unpack("<q", Path(self._file.name).read_bytes())[0])
-
-    def rate(self, seconds: float) -> float:
-        """Counts per second over the next seconds."""
-        begin, start = self.count(), time.monotonic()
-        time.sleep(seconds)
-        return (self.count() - begin) / (time.monotonic() - start)
-
-    def stop(self) -> None:
-        """End it."""
-        self._process.kill()
-        self._process.wait()
-        self._file.close()
+MARK = "@mark"
+TICK = 0.001
 
 
 @dataclass(frozen=True)
@@ -61,7 +34,7 @@ class Result:
 
     name: str
     received: int
-    cpu_s: float
+    cpu_s: float | None
     offered: int
     answers: int
     turnaround: NDArray[np.float64]
@@ -72,8 +45,10 @@ class Result:
         return float(1e6 * np.quantile(self.turnaround, q)) if self.turnaround.size else float("nan")
 
     @property
-    def cpu_us_per_frame(self) -> float:
-        return 1e6 * self.cpu_s / max(1, self.received)
+    def cpu(self) -> str:
+        if self.cpu_s is None:
+            return f"{'':>13s} {'':>6s}"
+        return f"{1e6 * self.cpu_s / max(1, self.received):13.1f} {100 * self.cpu_s / self.seconds:6.1f}"
 
 
 def _start(arguments: Sequence[str]) -> subprocess.Popen[str]:
@@ -110,25 +85,32 @@ def turnaround(frames: FrameBlock, protocol: Protocol) -> NDArray[np.float64]:
 
 
 def measure(name: str, arguments: Sequence[str] | None, channel: str, rate: float, seconds: float, fd: bool,
-            soaker: Soaker, others: float) -> Result:
-    """Run one subject (None: nobody) against the traffic; others: share of the processor used without it."""
+            tick: float, marks: bool) -> Result:
+    """Run one subject (None: nobody) against the traffic."""
     protocol = Protocol()
     subject = None if arguments is None else _start(arguments)
     source = _start(["tools.bench.source", channel, "--rate", str(rate), "--seconds", str(seconds),
-                     *(["--fd"] if fd else [])])
+                     "--tick", str(tick), *(["--fd"] if fd else [])])
     assert source.stdin is not None
     assert source.stdout is not None
     with SocketCanPort(channel, receive_buffer=1 << 26) as port:
         source.stdin.write("\n")
         source.stdin.flush()
         blocks = []
-        begin, start = soaker.count(), time.monotonic()
-        while time.monotonic() < start + seconds:
+        time.sleep(0.3)
+        start = time.monotonic()
+        before = None if subject is None or marks else cpu.of_process(subject.pid)
+        if marks:
+            print(f"{MARK} begin {name}", flush=True)
+        while time.monotonic() < start + seconds - 0.6:
             time.sleep(0.05)
             while len(block := port.receive(0.0)):
                 blocks.append(block)
-        soaked = (soaker.count() - begin) / (time.monotonic() - start) / soaker.full
-        time.sleep(0.5)
+        took_s = time.monotonic() - start
+        used = cpu.of_process(subject.pid) - before if subject is not None and before is not None else None
+        if marks:
+            print(f"{MARK} end {name}", flush=True)
+        time.sleep(1.0)
         while len(block := port.receive(0.0)):
             blocks.append(block)
         drops = port.drops
@@ -145,17 +127,20 @@ def measure(name: str, arguments: Sequence[str] | None, channel: str, rate: floa
         print(f"  (the recorder itself lost {drops} frames)")
     answers = int((frames.can_id == protocol.base_ids[MessageKind.POSITION_ESTIMATE]).sum())
     took = turnaround(frames, protocol) if not fd else np.zeros(0)
-    return Result(name, int(says.split()[0]), (1.0 - soaked - others) * seconds, offered, answers, took, seconds,
-                  says)
+    # Frames and CPU time of the same stretch: the traffic is even, so a share of the whole is right.
+    received = int(says.split()[0])
+    if marks and subject is not None:
+        print(f"{MARK} frames {round(received * took_s / seconds)} {name}", flush=True)
+    return Result(name, received, None if used is None else used * seconds / took_s, offered, answers, took,
+                  seconds, says)
 
 
 def table(results: Sequence[Result]) -> None:
     """Print all subjects side by side."""
-    print(f"{'subject':28s} {'received':>9s} {'of':>9s} {'CPU us/frame':>13s} {'CPU %':>6s} {'answers/s':>10s} "
+    print(f"{'subject':34s} {'received':>9s} {'of':>9s} {'CPU us/frame':>13s} {'CPU %':>6s} {'answers/s':>10s} "
           f"{'p50 us':>8s} {'p99 us':>8s} {'p99.9':>8s}")
     for r in results:
-        print(f"{r.name:28s} {r.received:9d} {r.offered:9d} {r.cpu_us_per_frame:13.1f} "
-              f"{100 * r.cpu_s / r.seconds:6.1f} "
+        print(f"{r.name:34s} {r.received:9d} {r.offered:9d} {r.cpu} "
               f"{r.answers / r.seconds:10.1f} {r.quantile_us(0.5):8.0f} {r.quantile_us(0.99):8.0f} "
               f"{r.quantile_us(0.999):8.0f}", flush=True)
 
@@ -166,31 +151,33 @@ def main() -> int:
     parser.add_argument("--channel", default="vcan0")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=5000.0)
-    parser.add_argument("--only", help="one subject: companion, companion_fd, echo, loop, recv")
+    parser.add_argument("--only", help="one subject: companion, recv, loop, spaced, echo, companion_fd")
     args = parser.parse_args()
     c, rate, s = args.channel, args.rate, args.seconds
+    ours = ["tools.bench.companion", c, "--rate", str(rate)]
+    rivals = {key: ["tools.bench.rivals", key, c] for key in ("echo", "recv", "loop")}
+    # A tick: five samples at once every millisecond, as `ipmsm-can drive` sends.  Spaced: each by itself.
     subjects = {
-        "companion": ("companion", ["tools.bench.companion", c, "--rate", str(rate)], rate, False),
-        "echo": ("bare Python echo", ["tools.bench.rivals", "echo", c], rate, False),
-        "recv": ("python-can recv alone", ["tools.bench.rivals", "recv", c], rate, False),
-        "loop": ("python-can + cantools loop", ["tools.bench.rivals", "loop", c], rate, False),
+        "companion": ("companion", ours, rate, False, TICK),
+        "recv": ("python-can recv alone", rivals["recv"], rate, False, TICK),
+        "loop": ("python-can + cantools loop", rivals["loop"], rate, False, TICK),
+        "spaced": ("companion, spaced samples", ours, rate, False, 0.0),
+        "echo": ("bare Python echo, spaced samples", rivals["echo"], rate, False, 0.0),
         "companion_fd": ("companion, FD, 10 kHz", ["tools.bench.companion", c, "--rate", "10000", "--fd"],
-                         10_000.0, True),
+                         10_000.0, True, 0.0),
     }
-    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    soaker = Soaker()
+    marks = cpu.is_counted_by_tick()
     results = []
-    others: dict[bool, float] = {}
-    for key, (name, arguments, r, fd) in subjects.items():
+    nobody: tuple[float, bool, float] | None = None
+    for key, (name, arguments, r, fd, tick) in subjects.items():
         if args.only in (None, key):
-            if fd not in others:
-                nobody = measure("nobody", None, c, r, min(s, 10.0), fd, soaker, 0.0)
-                others[fd] = nobody.cpu_s / nobody.seconds
-                print(f"  traffic {'FD' if fd else 'classical'} without a subject: {100 * others[fd]:.1f} % "
-                      "of the processor", flush=True)
-            results.append(measure(name, arguments, c, r, s, fd, soaker, others[fd]))
+            if marks and nobody != (r, fd, tick):
+                measure("nobody", None, c, r, min(s, 10.0), fd, tick, marks)
+                nobody = (r, fd, tick)
+            results.append(measure(name, arguments, c, r, s, fd, tick, marks))
             print(f"  {name}: {results[-1].says}", flush=True)
-    soaker.stop()
+            if marks:
+                measure("nobody", None, c, r, min(s, 10.0), fd, tick, marks)
     table(results)
     return 0
 
