@@ -151,6 +151,8 @@ class Node:
 
     def _injected(self, run: SampleRun) -> NDArray[np.uint8]:
         """What the last DriveStatus before each sample said: by time, so that blocks make no difference."""
+        if not self._said_at.size or self._said_at[-1] < run.t_ns[0]:
+            return np.full(run.t_ns.size, self._said[-1], np.uint8)
         return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")].astype(np.uint8)
 
     def _estimate(self, run: SampleRun) -> EstimateBlock:

@@ -22,6 +22,7 @@ EXPONENTS = [
     (units.OHM, {"uohm": -6, "mohm": -3, "ohm": 0}),
     (units.VOLT, {"mV": -3, "V": 0, "kV": 3}),
     (units.VOLT_PEAK, {"mV": -3, "V": 0, "kV": 3}),
+    (units.AMPERE, {"mA": -3, "A": 0, "kA": 3}),
     (units.AMPERE_PEAK, {"mA": -3, "A": 0, "kA": 3}),
     (units.AMPERE_RMS, {"mA": -3, "A": 0, "kA": 3}),
     (units.SECOND, {"us": -6, "ms": -3, "s": 0}),
@@ -32,6 +33,7 @@ EXPONENTS = [
     (units.EXCITATION, {"V^2 s": 0}),
     (units.GRADIENT_GAIN, {"1/(V^2 s)": 0}),
     (units.NEWTON_METRE, {"mN m": -3, "N m": 0, "Nm": 0}),
+    (units.FRICTION, {"mN m s": -3, "N m s": 0}),
     (units.INERTIA, {"kg m^2": 0, "kg cm^2": -4, "g cm^2": -7}),
 ]
 CASES = [(unit, spelling, exponent) for unit, table in EXPONENTS for spelling, exponent in table.items()]

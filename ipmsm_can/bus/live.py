@@ -2,7 +2,8 @@
 
 Between two answers there is nothing to do but collect samples.  A process that wakes up for every frame pays
 for every frame; so the runner asks the port for as many frames as are missing until the next sample that is
-to be answered, and is woken once, by that one.
+to be answered, and is woken once, by that one.  A companion that only listens has nothing to be in time for: it
+lets frames gather.
 
 The clock is the frames' own: the time of the newest frame is now.  Only silence is timed by the runner.
 """
@@ -23,6 +24,8 @@ from ipmsm_can.frames import FrameBlock
 
 IDLE_S = 0.02
 """Longest wait for a frame: the clock makes status and commands due."""
+GATHER_S = 0.01
+"""How long a companion that only listens lets frames gather; the port's buffer holds many times that."""
 TURNAROUND_EVERY = 8
 """Of so many answers, one is timed: reading the clock is not free everywhere."""
 LOAD_EVERY = 32
@@ -68,6 +71,7 @@ class LiveRunner:
         self._answered = 0
         self._unweighed: list[FrameBlock] = []
         self._rounds = 0
+        self._flowing = False
 
     def run(self, stop: Callable[[], bool], observer: Observer | None = None) -> None:
         """Serve the bus until stop() says so; raises BusError when the bus goes away."""
@@ -77,7 +81,7 @@ class LiveRunner:
     def round(self, observer: Observer | None = None) -> None:
         """Wait for the frames up to the next one that is to be answered, and answer."""
         companion = self.companion
-        block = self.port.receive(IDLE_S, companion.frames_until_due(self._now_ns))
+        block = self._receive()
         now = self._time(block)
         tracked = companion.feed(block)
         answers = companion.respond(tracked, now)
@@ -88,6 +92,15 @@ class LiveRunner:
         self._weigh(block, answers, now)
         if observer is not None:
             observer(block, tracked, answers, now)
+
+    def _receive(self) -> FrameBlock:
+        if self.companion.transmit:
+            return self.port.receive(IDLE_S, self.companion.frames_until_due(self._now_ns))
+        if self._flowing:
+            time.sleep(GATHER_S)
+        block = self.port.receive(IDLE_S)
+        self._flowing = len(block) > 0
+        return block
 
     def _time(self, block: FrameBlock) -> int:
         if len(block):

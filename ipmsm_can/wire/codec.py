@@ -241,7 +241,8 @@ class MessageCodec:
             for name, column in columns.items():
                 matrix[self.index[name]] = column
             return matrix
-        array = np.array(values, np.float64, order="C", copy=None)
+        plain = isinstance(values, np.ndarray) and values.dtype == np.float64 and values.flags.carray
+        array = values if plain else np.array(values, np.float64, order="C", copy=None)
         if array.ndim != 2 or array.shape[0] != len(self.signals):
             raise ValueError(f"values for message {self.name} have shape {array.shape}; "
                              f"allowed is ({len(self.signals)}, N)")

@@ -181,14 +181,18 @@ def _deselect(buf: _U64, n: int, shortest: np.int64, table: _I64, ranges: _I64, 
 def _gather(words: _U64, rows: _Rows, use_rows: bool, start: int, n: int, n_words: int,
             buf: _U64) -> np.int64:
     """Turn the chunk word-major; returns the shortest payload length in it."""
+    if not use_rows:
+        for w in range(n_words + 1):
+            for k in range(n):
+                buf[w, k] = words[start + k, w]
+    else:
+        for k in range(n):
+            r = rows[start + k]
+            for w in range(n_words + 1):
+                buf[w, k] = words[r, w]
     shortest = np.int64(64)
     for k in range(n):
-        r = rows[start + k] if use_rows else start + k
-        header = words[r, 0]
-        buf[0, k] = header
-        shortest = min(shortest, np.int64((header >> np.uint64(32)) & np.uint64(0xFF)))
-        for w in range(1, n_words + 1):
-            buf[w, k] = words[r, w]
+        shortest = min(shortest, np.int64((buf[0, k] >> np.uint64(32)) & np.uint64(0xFF)))
     return shortest
 
 
@@ -205,19 +209,33 @@ def decode_block(words: _U64, rows: _Rows, use_rows: bool, n_words: int, table: 
         n = min(_CHUNK, total - start)
         shortest = _gather(words, rows, use_rows, start, n, n_words, buf)
         for s in range(table.shape[0]):
-            _raw_bits(buf, n, table, s, bits)
             scale = scaling[s, SCALE]
             offset = scaling[s, OFFSET]
             kind = table[s, KIND]
-            if kind == SIGNED or (kind == UNSIGNED and table[s, LENGTH] < 64):
-                for k in range(n):  # a signed conversion is one machine instruction, an unsigned one is not
-                    out[s, start + k] = np.float64(np.int64(bits[k])) * scale + offset
-            elif kind == UNSIGNED:
-                for k in range(n):
-                    out[s, start + k] = np.float64(bits[k]) * scale + offset
+            length = table[s, LENGTH]
+            shift = table[s, SHIFT]
+            if kind != FLOAT and length < 64 and shift + length <= 64 and not table[s, MOTOROLA]:
+                # The usual case in one pass: up to the top of the word, down again, to a number.
+                word = buf[table[s, WORD]]
+                up = np.uint64(64 - shift - length)
+                down = np.uint64(64 - length)
+                if kind == SIGNED:
+                    for k in range(n):
+                        out[s, start + k] = np.float64(np.int64(word[k] << up) >> np.int64(down)) * scale + offset
+                else:
+                    for k in range(n):
+                        out[s, start + k] = np.float64(np.int64((word[k] << up) >> down)) * scale + offset
             else:
-                for k in range(n):
-                    out[s, start + k] = _from_pattern(bits[k], table[s, LENGTH]) * scale + offset
+                _raw_bits(buf, n, table, s, bits)
+                if kind == FLOAT:
+                    for k in range(n):
+                        out[s, start + k] = _from_pattern(bits[k], length) * scale + offset
+                elif kind == SIGNED or length < 64:
+                    for k in range(n):  # a signed conversion is one machine instruction, an unsigned one is not
+                        out[s, start + k] = np.float64(np.int64(bits[k])) * scale + offset
+                else:
+                    for k in range(n):
+                        out[s, start + k] = np.float64(bits[k]) * scale + offset
             if table[s, PARENT] >= 0 or shortest < table[s, END]:
                 _deselect(buf, n, shortest, table, ranges, s, bits, absent)
                 for k in range(n):

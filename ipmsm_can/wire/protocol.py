@@ -276,8 +276,10 @@ class Protocol:
         if protection is not None:
             if counters is None:
                 raise ValueError(f"{kind.message} is protected; encode needs its counters")
-            numbers = np.broadcast_to(np.asarray(counters, np.int64), raw.shape[:1])
-            protection.protect(raw, np.array(numbers))
+            numbers = np.asarray(counters, np.int64)
+            if numbers.shape != raw.shape[:1]:
+                numbers = np.array(np.broadcast_to(numbers, raw.shape[:1]))
+            protection.protect(raw, numbers)
         return raw
 
     def decode(self, kind: MessageKind, node: int, raw: NDArray[np.uint8],

@@ -25,20 +25,21 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--no-bus", action="store_true")
     parser.add_argument("--only-bus", action="store_true")
+    parser.add_argument("--only", default="", help="some subjects on the bus, by comma; see tools.bench.on_bus")
     args = parser.parse_args()
     if not args.only_bus:
         offline.main()
     if args.no_bus:
         return 0
     print(flush=True)
-    return on_bus(args.seconds)
+    return on_bus(args.seconds, args.only)
 
 
-def on_bus(seconds: float) -> int:
+def on_bus(seconds: float, only: str) -> int:
     """The part on a bus, in whatever tools/vcan/run provides; reads the CPU time at its marks."""
     runner = Path(__file__).resolve().parents[1] / "vcan" / "run"
-    process = subprocess.Popen([str(runner), sys.executable, "-m", "tools.bench.on_bus", "--seconds", str(seconds)],
-                               stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen([str(runner), sys.executable, "-m", "tools.bench.on_bus", "--seconds", str(seconds),
+                                *(["--only", only] if only else [])], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     stretches: list[tuple[str, float, float]] = []  # name, CPU seconds, length
     frames: dict[str, int] = {}

@@ -10,6 +10,8 @@ import argparse
 import signal
 from typing import Any
 
+import numpy as np
+
 from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.companion import Companion
@@ -24,11 +26,14 @@ def main() -> None:
     parser.add_argument("channel")
     parser.add_argument("--fd", action="store_true")
     parser.add_argument("--rate", type=float, default=5000.0)
+    parser.add_argument("--told", action="store_true", help="take the sample rate from the configuration")
+    parser.add_argument("--silent", action="store_true", help="only listen")
     args = parser.parse_args()
-    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False}})
+    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False},
+                          "wire": {"sample_rate": args.rate} if args.told else {}})
     warm = Companion([config], Protocol(), transmit=True)
     warm.process(drive_frames(args.rate, 0.2, args.fd), 0)
-    companion = Companion([config], Protocol(), transmit=True)
+    companion = Companion([config], Protocol(), transmit=not args.silent)
     stopping = False
 
     def stop(*_: Any) -> None:
@@ -41,7 +46,7 @@ def main() -> None:
         print("ready", flush=True)
         runner.run(lambda: stopping)
         node = companion.nodes[0]
-        q = runner.turnaround.quantiles((0.5, 0.99, 0.999))
+        q = np.nan_to_num(runner.turnaround.quantiles((0.5, 0.99, 0.999)))
         print(companion.counts.frames, node.view.estimates, node.receiver.sequencer.count("lost"), port.drops,
               *(round(1e6 * x) for x in q), flush=True)
 

@@ -61,17 +61,18 @@ def _start(arguments: Sequence[str]) -> subprocess.Popen[str]:
     return process
 
 
-def turnaround(frames: FrameBlock, protocol: Protocol) -> NDArray[np.float64]:
+def turnaround(frames: FrameBlock, protocol: Protocol, echoed: bool) -> NDArray[np.float64]:
     """Seconds from each answered sample to its answer, by the kernel's time stamps.
 
-    A rival answers with the sample's own 4-bit counter somewhere; the order tells: each answer belongs to the
-    last sample before it whose counter is due.  The companion names its sample by ten bits.
+    An answer names its sample by the low bits of the counter; the echo sends the sample's payload back.
     """
     ids = frames.can_id & 0x7FF
     base = protocol.base_ids
     answers = np.flatnonzero(ids == base[MessageKind.POSITION_ESTIMATE])
     codec = protocol.codecs[MessageKind.POSITION_ESTIMATE]
     low = codec.decode_rows(frames.words, answers)[codec.index["sample_counter"]].astype(int) & 0xF
+    if echoed:
+        low = frames.data[answers, 7] >> 4
     samples = np.flatnonzero(ids == base[MessageKind.DRIVE_SAMPLE])
     counters = (frames.data[samples, 7] >> 4).astype(int)
     out = []
@@ -85,12 +86,12 @@ def turnaround(frames: FrameBlock, protocol: Protocol) -> NDArray[np.float64]:
 
 
 def measure(name: str, arguments: Sequence[str] | None, channel: str, rate: float, seconds: float, fd: bool,
-            tick: float, marks: bool) -> Result:
+            tick: float | None, marks: bool) -> Result:
     """Run one subject (None: nobody) against the traffic."""
     protocol = Protocol()
     subject = None if arguments is None else _start(arguments)
     source = _start(["tools.bench.source", channel, "--rate", str(rate), "--seconds", str(seconds),
-                     "--tick", str(tick), *(["--fd"] if fd else [])])
+                     *(["--kernel"] if tick is None else ["--tick", str(tick)]), *(["--fd"] if fd else [])])
     assert source.stdin is not None
     assert source.stdout is not None
     with SocketCanPort(channel, receive_buffer=1 << 26) as port:
@@ -126,7 +127,7 @@ def measure(name: str, arguments: Sequence[str] | None, channel: str, rate: floa
     if drops:
         print(f"  (the recorder itself lost {drops} frames)")
     answers = int((frames.can_id == protocol.base_ids[MessageKind.POSITION_ESTIMATE]).sum())
-    took = turnaround(frames, protocol) if not fd else np.zeros(0)
+    took = turnaround(frames, protocol, "echo" in name) if not fd else np.zeros(0)
     # Frames and CPU time of the same stretch: the traffic is even, so a share of the whole is right.
     received = int(says.split()[0])
     if marks and subject is not None:
@@ -137,10 +138,10 @@ def measure(name: str, arguments: Sequence[str] | None, channel: str, rate: floa
 
 def table(results: Sequence[Result]) -> None:
     """Print all subjects side by side."""
-    print(f"{'subject':34s} {'received':>9s} {'of':>9s} {'CPU us/frame':>13s} {'CPU %':>6s} {'answers/s':>10s} "
+    print(f"{'subject':38s} {'received':>9s} {'of':>9s} {'CPU us/frame':>13s} {'CPU %':>6s} {'answers/s':>10s} "
           f"{'p50 us':>8s} {'p99 us':>8s} {'p99.9':>8s}")
     for r in results:
-        print(f"{r.name:34s} {r.received:9d} {r.offered:9d} {r.cpu} "
+        print(f"{r.name:38s} {r.received:9d} {r.offered:9d} {r.cpu} "
               f"{r.answers / r.seconds:10.1f} {r.quantile_us(0.5):8.0f} {r.quantile_us(0.99):8.0f} "
               f"{r.quantile_us(0.999):8.0f}", flush=True)
 
@@ -151,26 +152,31 @@ def main() -> int:
     parser.add_argument("--channel", default="vcan0")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=5000.0)
-    parser.add_argument("--only", help="one subject: companion, recv, loop, spaced, echo, companion_fd")
+    parser.add_argument("--only", help="subjects, by comma: listening, spaced, echo, recv, loop, companion, "
+                                       "recv_tick, companion_fd")
     args = parser.parse_args()
     c, rate, s = args.channel, args.rate, args.seconds
     ours = ["tools.bench.companion", c, "--rate", str(rate)]
     rivals = {key: ["tools.bench.rivals", key, c] for key in ("echo", "recv", "loop")}
-    # A tick: five samples at once every millisecond, as `ipmsm-can drive` sends.  Spaced: each by itself.
-    subjects = {
-        "companion": ("companion", ours, rate, False, TICK),
-        "recv": ("python-can recv alone", rivals["recv"], rate, False, TICK),
-        "loop": ("python-can + cantools loop", rivals["loop"], rate, False, TICK),
-        "spaced": ("companion, spaced samples", ours, rate, False, 0.0),
-        "echo": ("bare Python echo, spaced samples", rivals["echo"], rate, False, 0.0),
+    # Spaced: each sample by itself, as on a real bus, sent by the kernel.  A tick: five samples at once every
+    # millisecond, as `ipmsm-can drive` sends.  The companion is told the sample rate where no DriveTiming comes.
+    told = [*ours, "--told"]
+    subjects: dict[str, tuple[str, list[str], float, bool, float | None]] = {
+        "listening": ("companion, listening only", [*told, "--silent"], rate, False, None),
+        "spaced": ("companion, answering at 1 kHz", told, rate, False, None),
+        "echo": ("bare Python echo", rivals["echo"], rate, False, None),
+        "recv": ("python-can recv alone", rivals["recv"], rate, False, None),
+        "loop": ("python-can + cantools loop", rivals["loop"], rate, False, None),
+        "companion": ("companion, answering, five at a time", ours, rate, False, TICK),
+        "recv_tick": ("python-can recv alone, five at a time", rivals["recv"], rate, False, TICK),
         "companion_fd": ("companion, FD, 10 kHz", ["tools.bench.companion", c, "--rate", "10000", "--fd"],
                          10_000.0, True, 0.0),
     }
     marks = cpu.is_counted_by_tick()
     results = []
-    nobody: tuple[float, bool, float] | None = None
+    nobody: tuple[float, bool, float | None] | None = None
     for key, (name, arguments, r, fd, tick) in subjects.items():
-        if args.only in (None, key):
+        if args.only is None or key in args.only.split(","):
             if marks and nobody != (r, fd, tick):
                 measure("nobody", None, c, r, min(s, 10.0), fd, tick, marks)
                 nobody = (r, fd, tick)
