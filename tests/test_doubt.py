@@ -27,8 +27,8 @@ def traffic(rpm: float, seconds: float) -> tuple[FrameBlock, np.ndarray]:
     return step.frames, step.samples.theta_e
 
 
-def follow(frames: FrameBlock) -> list[Tracked]:
-    companion = Companion([config_from({"motor": {"preset": "m2"}})], PROTOCOL, transmit=False)
+def follow(frames: FrameBlock, wire: dict[str, float] | None = None) -> list[Tracked]:
+    companion = Companion([config_from({"motor": {"preset": "m2"}, "wire": wire or {}})], PROTOCOL, transmit=False)
     return companion.feed(frames)
 
 
@@ -60,6 +60,24 @@ def test_a_loss_of_whole_wraps_is_never_valid_and_wrong(missing: int, begin: int
         assert doubt.any()
     assert not (flags[doubt != 0] & confidence.VALID).any()
     assert worst_valid(tracked, theta) < 15.0
+    assert flags[-1] & confidence.VALID
+    assert not doubt[-1]
+
+
+@pytest.mark.parametrize("missing", [16, 32, 48, 160, 803, 3001])
+@pytest.mark.parametrize("rpm", [300.0, 1000.0])
+def test_a_drive_without_timing_is_not_believed_either_until_the_pace_settles_it(missing: int, rpm: float) -> None:
+    frames, theta = traffic(rpm, 4.0)
+    is_sample = frames.can_id == PROTOCOL.base_ids[MessageKind.DRIVE_SAMPLE]
+    number = np.cumsum(is_sample) - 1
+    keep = is_sample & ~((number >= 7003) & (number < 7003 + missing))
+    tracked = follow(frames.take(np.flatnonzero(keep)), {"sample_rate": RATE})
+    flags = np.concatenate([t.estimate.flags for t in tracked])
+    doubt = np.concatenate([t.run.doubt for t in tracked])
+    counter = np.concatenate([t.run.counter for t in tracked])
+    assert doubt.any()
+    assert worst_valid(tracked, theta) < 15.0
+    assert counter[-1] == theta.size - 1
     assert flags[-1] & confidence.VALID
     assert not doubt[-1]
 

@@ -40,6 +40,8 @@ LONGEST_SILENCE = 60.0
 LATE_AT_MOST = 0.5
 """Longest silence [s] after which the next counter value is taken for a late sample: so long may a busy
 computer hold up a sender; it costs no more than waiting for the next DriveTiming when samples were lost."""
+SETTLED_AFTER_NS = 1_000_000_000
+"""Without DriveTiming: samples that still come late so long [ns] after a silence were lost, not held up."""
 TIMING_LATE_AT_MOST = 3
 """Samples that may overtake a DriveTiming on their way."""
 PENDING_MAX = 1 << 17
@@ -54,7 +56,7 @@ Ints = NDArray[np.int64]
 STATE = np.dtype([
     ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
     ("rate", "f8"), ("synced", "i8"), ("guess", "i8"), ("offset", "i8"), ("restarted", "i8"),
-    ("correction", "i8"), ("doubt", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
+    ("correction", "i8"), ("doubt", "i8"), ("doubted_t", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
 ])
 
 RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
@@ -132,14 +134,16 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
     if delta == 1 and least <= 1 and expected <= LATE_AT_MOST * st.rate:
         # Exactly the next one: late rather than exactly 16, 32, ... lost.
         if expected - delta > HALF_WRAP:
-            st.doubt = st.synced
+            st.doubt = 1
+            st.doubted_t = t_ns
         return 1
     steps = delta + 16 * int(np.floor((expected - delta) / 16.0 + 0.5))
     if steps < proven and (steps > 0 or least >= 16):
         steps = proven
     if steps >= proven + 16 and steps > 16:
         st.guess += (steps - max(proven, 1)) // 16
-        st.doubt = st.synced
+        st.doubt = 1
+        st.doubted_t = t_ns
     return int(steps)
 
 
@@ -198,7 +202,9 @@ def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
 
 @kernel
 def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
-    """Put right a guess after which a sample arrives earlier than any before it, by half a wrap or more."""
+    """Put right a guess after which samples arrive earlier than any before them, by half a wrap or more; without
+    DriveTiming, also one after which they stay late.
+    """
     period = 1e9 / st.rate
     offset = t_ns - int(st.last * period)
     early = (st.offset - offset) / period
@@ -209,6 +215,16 @@ def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
         st.correction -= 16 * wraps
         counts[LOST] -= 16 * wraps
         counts[RESYNCS] += 1
+    elif st.doubt and not st.synced and t_ns - st.doubted_t > SETTLED_AFTER_NS:
+        # There may never be a DriveTiming to settle it.
+        wraps = max(int(-early / 16.0 + 0.5), 0)
+        st.last += 16 * wraps
+        st.correction += 16 * wraps
+        counts[LOST] += 16 * wraps
+        counts[RESYNCS] += 1 if wraps else 0
+        st.guess = 0
+        st.doubt = 0
+        st.offset = t_ns - int(st.last * period)
     elif st.guess == 0:
         if early > -HALF_WRAP:
             st.doubt = 0  # as prompt as ever: it was late, and nothing is missing
