@@ -48,6 +48,19 @@ def test_ramps_up_at_low_speed_and_says_so() -> None:
     assert command == Command(Waveform.ROTATING, 6.0, 400.0, 0.0, 0.1)
 
 
+@pytest.mark.parametrize("current", [float("nan"), float("inf")])
+def test_a_current_that_cannot_be_measured_ends_injection(current: float) -> None:
+    s = Stand()
+    s.go(10)
+    s.current = current
+    s.go(5)
+    assert s.scheduler.amplitude == 0.0
+    assert s.told == ("LIMITED", "CURRENT_LIMIT")
+    s.current = 0.0
+    s.go(600)
+    assert s.scheduler.amplitude == pytest.approx(6.0)
+
+
 def test_ramps_down_at_speed_with_hysteresis() -> None:
     s = Stand()
     s.go(10)

@@ -7,6 +7,7 @@ scheduler has no clock: it is asked once per command period, with the time of th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from ipmsm_can.wire.protocol import InjectionReason, InjectionState, Waveform
@@ -132,7 +133,9 @@ class InjectionScheduler:
     def _limit(self, current: float, elapsed: float) -> float:
         """Share of the amplitude that the current limit leaves, 0..1."""
         limit = self.settings.current_limit
-        if current > limit and self.amplitude > 0.0:
+        if not math.isfinite(current):
+            self._share = 0.0  # nobody knows how much it is: no injection until it can be measured again
+        elif current > limit and self.amplitude > 0.0:
             # In proportion, from what is injected now: the machine is linear in the small.
             self._share = min(self._share, self.amplitude / self.settings.amplitude * limit / current)
         elif current < 0.9 * limit:
