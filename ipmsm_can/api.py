@@ -66,12 +66,14 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
     current, voltage = _vectors("i", i), _vectors("v", v)
     if current.shape != voltage.shape:
         raise ValueError(f"i has {current.shape[1]} samples and v {voltage.shape[1]}; allowed are equal numbers")
-    if not 100.0 <= sample_rate <= 100_000.0:
+    if not isinstance(sample_rate, (int, float, np.integer, np.floating)) or not 100.0 <= sample_rate <= 100_000.0:
         raise ValueError(f"sample_rate is {sample_rate!r}; allowed is 100 to 100000 Hz")
     if isinstance(motor, str):
         if motor not in PRESETS:
             raise ValueError(f"motor is {motor!r}; allowed is a Motor or one of {', '.join(PRESETS)}")
         motor = PRESETS[motor]
+    if not isinstance(motor, Motor):
+        raise ValueError(f"motor is {motor!r}; allowed is a Motor or one of {', '.join(PRESETS)}")
     config = config_from({
         "motor": {name: getattr(motor, name) for name in ("pole_pairs", "psi_m", "L_d", "L_q", "R", "J",
                                                           "rated_torque")},
@@ -90,7 +92,10 @@ def _vectors(name: str, given: ArrayLike) -> Floats:
         array = np.stack([array.real, array.imag], axis=1)
     if array.ndim != 2 or array.shape[1] != 2 or np.iscomplexobj(array):
         raise ValueError(f"{name} has shape {array.shape}; allowed is (N, 2) with alpha and beta, or complex (N,)")
-    values = array.astype(np.float64)
+    try:
+        values = array.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} holds {array.dtype}; allowed are numbers") from None
     if not np.isfinite(values).all():
         row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise ValueError(f"{name}[{row}] is {values[row].tolist()}; allowed are finite numbers")

@@ -187,7 +187,10 @@ WRONG = [
      "wire.data_bitrate is 500000; allowed is wire.bitrate (1000000 bit/s) or more"),
     # several at once
     (M2_ONLY + "[wire]\nnode = 16\nmax_gap = 65",
-     "wire.node is 16; allowed is a whole number, from 0 to 15 (and 1 more of this kind of problem)"),
+     "wire.node is 16; allowed is a whole number, from 0 to 15 (and 1 more problem)"),
+    (M2_ONLY + "[wire]\nnode = 16\nmax_gap = 65\nbitrate = 1",
+     "wire.node is 16; allowed is a whole number, from 0 to 15 (and 2 more problems)"),
+    ("[moter]\npreset = 'm2'", "moter is not a known section; did you mean motor?"),
     # broken TOML
     ("[motor]\npreset = m2", "line 2, column 10: not valid TOML: invalid value"),
     ("[motor", "line 1: not valid TOML: expected ']'"),

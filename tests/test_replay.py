@@ -425,6 +425,16 @@ def test_the_wrong_log(tmp_path: Path, protocol: Protocol, capsys: pytest.Captur
     assert not (tmp_path / "a.csv").exists()
 
 
+def test_a_channel_that_is_not_in_the_log(tmp_path: Path, protocol: Protocol,
+                                          capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "a.log"
+    write_log(log, [drive_frames(protocol, 0.1, node=3)], channel="can0")
+    assert main(["replay", str(log), "--drive", toml(tmp_path), "--channel", "can9"]) == 2
+    assert "holds no frame of channel 'can9'" in capsys.readouterr().err
+    assert main(["replay", str(log), "--drive", toml(tmp_path), "--channel", "can0"]) == 2
+    assert "no sample frame of node 0 on channel 'can0' (identifiers" in capsys.readouterr().err
+
+
 def test_no_drive_timing(tmp_path: Path, protocol: Protocol, capsys: pytest.CaptureFixture[str]) -> None:
     log = tmp_path / "a.log"
     write_log(log, [drive_frames(protocol, 0.1, timing_rate=0.0)])

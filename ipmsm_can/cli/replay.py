@@ -85,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
     print(session.report())
     absent = [c for c in configs if not session.replay.summaries[c.wire.node].rows]
     for config in absent:
-        print(f"ipmsm-can replay: {_absence(config, session.replay, protocol, log)}", file=sys.stderr)
+        print(f"ipmsm-can replay: {_absence(config, session.replay, protocol, log, args.channel)}", file=sys.stderr)
     if reader.problem or reader.bad_lines:
         told = reader.problem or f"{log} is damaged: {reader.bad_lines} of its lines cannot be read"
         print(f"ipmsm-can replay: {told}; what was readable is replayed", file=sys.stderr)
@@ -252,7 +252,7 @@ def _share(part: int, whole: int) -> str:
     return f"{100.0 * part / whole:.1f} %"
 
 
-def _absence(config: DriveConfig, replay: Replay, protocol: Protocol, log: Path) -> str:
+def _absence(config: DriveConfig, replay: Replay, protocol: Protocol, log: Path, channel: str | None) -> str:
     """Why there is not one row of this drive, in one sentence."""
     from ipmsm_can.wire.protocol import MessageKind
 
@@ -267,7 +267,10 @@ def _absence(config: DriveConfig, replay: Replay, protocol: Protocol, log: Path)
                 f"({node.bad_frames} bad)")
     ids = " and ".join(f"0x{protocol.base_ids[kind] + number:X}"
                        for kind in (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK))
-    return (f"{log} holds no sample frame of node {number} (identifiers {ids}); "
+    if channel is not None and not (replay.standard_ids.any() or replay.extended_ids):
+        return f"{log} holds no frame of channel {channel!r}; without --channel those of every channel are taken"
+    where = "" if channel is None else f" on channel {channel!r}"
+    return (f"{log} holds no sample frame of node {number}{where} (identifiers {ids}); "
             f"seen were {_ids_seen(replay.standard_ids, replay.extended_ids)}")
 
 

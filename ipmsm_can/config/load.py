@@ -81,8 +81,10 @@ def config_from(data: Mapping[str, Any], source: str = "drive.toml", folder: str
     try:
         return DriveConfig.model_validate(dict(data), context={"folder": Path(folder)})
     except ValidationError as error:
-        problems = error.errors(include_url=False)
-        more = f" (and {len(problems) - 1} more of this kind of problem)" if len(problems) > 1 else ""
+        # A misspelt [motor] is told before the missing one that it leaves behind.
+        problems = sorted(error.errors(include_url=False), key=lambda problem: problem["type"] == "missing")
+        others = len(problems) - 1
+        more = f" (and {others} more problem{'s' if others > 1 else ''})" if others else ""
         raise ConfigError(f"{source}: {_sentence(problems[0], data)}{more}") from None
 
 

@@ -222,7 +222,7 @@ def _error(record: Record, c: Comparison, s: Summary, end: float, spans: tuple[S
              else "The angle never became valid")
     return Panel("error", title,
                  "Error of the angle in electrical degrees; the scale is fine around 0 and coarse far out. "
-                 "At standstill nothing in the currents tells the angle, and the companion says so.",
+                 "Until the rotor first turns the observer cannot know the angle, and the companion says so.",
                  "° electrical", scale, 0.0, end, 1.25, lines, bands, spans, loads=loads)
 
 
@@ -266,7 +266,7 @@ def _probing(record: Record, end: float, loads: tuple[Mark, ...]) -> Panel:
     lines = (Line(x, y, "probe", "asked by the companion"),
              Line(record.time, obeyed, "obeyed", "the drive says that it injects"))
     bands = (Band(x, np.zeros_like(y), y, "probe"),)
-    return Panel("probing", "A probing voltage helps at low speed and is off at speed",
+    return Panel("probing", "The probing voltage is on at low speed and off at speed",
                  "Amplitude that the companion asks the drive to add to its voltage, at 400 Hz unless configured "
                  "otherwise; cut back where it would drive too much current.",
                  "V peak", _from_zero(max(1.0, float(y.max(initial=0.0)))), 0.0, end, 0.55, lines, bands,
