@@ -186,3 +186,15 @@ def test_a_sudden_half_turn_loses_the_lock() -> None:
     assert estimator.lost_locks == 1
     assert out.flags[-1] & confidence.VALID
     assert abs(degrees_between(out.angle[0], other.theta(np.arange(n) / RATE))[-1]) < 1.0
+
+
+@pytest.mark.parametrize("spike", [1e30, 1e100, 1e200])
+def test_an_absurd_sample_leaves_nothing_that_looks_like_knowledge(spike: float) -> None:
+    """Possible where somebody's database has float signals."""
+    samples = Rotating(M2, 400.0).samples(RATE, 8000)
+    samples[0, 5000] = spike
+    with np.errstate(all="ignore"):
+        estimate = Estimator(M2, RATE, settings(M2, 10.0, 0.5)).process(samples)
+    assert estimate.flags[4999] & confidence.VALID
+    assert (estimate.sigma <= math.pi).all()
+    assert not (estimate.flags[5010:] & (confidence.VALID | confidence.LOCKED)).any()

@@ -162,8 +162,10 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
         # Angle uncertainty across the direction of x_hat.
         if x2 > st.epsilon * st.epsilon:
             across = (x_b * x_b * p_aa - 2.0 * x_a * x_b * p_ab + x_a * x_a * p_bb) / x2
-            s = min(math.sqrt(max(across, 0.0) / x2), math.pi)
+            s = math.sqrt(max(across, 0.0) / x2)
         else:
+            s = math.pi
+        if not s < math.pi:  # as well where an absurd sample made it NaN
             s = math.pi
         # Polarity: contraction gathered while y cannot be explained by standstill.
         h = math.sqrt(regression[5, k] ** 2 + regression[6, k] ** 2)
