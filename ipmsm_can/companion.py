@@ -100,20 +100,20 @@ class Node:
         self._protocol = protocol
         self._motor = config.build_motor()
         self._settings = estimator_settings(config)
-        self._estimator: Estimator | None = None
-        self._meter = meter.new_state(config.injection.frequency, 1.0)
+        self.estimator: Estimator | None = None
+        self.meter = meter.new_state(config.injection.frequency, 1.0)
         self._last_arrival: int | None = None
-        self._samples_per_frame = 1
+        self.samples_per_frame = 1
         self._next_status: int | None = None
         self._next_command: int | None = None
-        self._position_counter = 0
+        self.position_counter = 0
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index
         self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
         position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
         self._position_width = len(position.signals)
-        self._position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
-        self._position_step = position.layouts[position.index["theta_e"]].scale
+        self.position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
+        self.position_step = position.layouts[position.index["theta_e"]].scale
 
     # Frames in
 
@@ -123,7 +123,7 @@ class Node:
         blocks = rows.get(_BLOCK, none)
         runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none), blocks)
         if runs:
-            self._samples_per_frame = BLOCK_SAMPLES if blocks.size else 1
+            self.samples_per_frame = BLOCK_SAMPLES if blocks.size else 1
         status = rows.get(_STATUS, none)
         if status.size:
             values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
@@ -156,16 +156,21 @@ class Node:
         return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")].astype(np.uint8)
 
     def _estimate(self, run: SampleRun) -> EstimateBlock:
-        estimator = self._estimator
+        estimator = self.estimator
         if estimator is None or estimator.sample_rate != run.sample_rate:
-            estimator = self._estimator = Estimator(self._motor, run.sample_rate, self._settings)
+            estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
             frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
-            self._meter = meter.new_state(frequency, run.sample_rate)
+            self.meter = meter.new_state(frequency, run.sample_rate)
         estimate = estimator.process(run.values, run.gap)
         if run.doubt.any():
             estimate.flags[run.doubt != 0] &= 0xFF ^ confidence.VALID
+        self.note(run, estimate, meter.meter_block(run.values, self.meter))
+        return estimate
+
+    def note(self, run: SampleRun, estimate: EstimateBlock, hf_current: float) -> None:
+        """Keep the newest of these samples as the view; hf_current [A peak]."""
         view = self.view
-        view.hf_current = meter.meter_block(run.values, self._meter)
+        view.hf_current = hf_current
         view.sample = int(run.counter[-1])
         view.sample_rate = run.sample_rate
         view.theta = float(estimate.angle[speed.THETA_HAT, -1])
@@ -174,7 +179,6 @@ class Node:
         view.excitation = float(estimate.excitation[-1])
         view.flags = int(estimate.flags[-1])
         self._last_arrival = int(run.t_ns[-1])
-        return estimate
 
     # Frames out
 
@@ -187,18 +191,31 @@ class Node:
             due = due_rows(counter, _every(rate, self.config.estimate.rate), oldest)
             if due.size:
                 frames.append(self._position(part, due))
-            due = due_rows(counter, _every(rate, self.config.estimate.flux_rate), oldest)
+        return frames + self.flux_answers(tracked)
+
+    def flux_answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
+        """ActiveFluxEstimate frames for the samples that are due."""
+        frames = []
+        for part in tracked:
+            rate = part.run.sample_rate
+            oldest = int(OLDEST_ANSWER * rate)
+            due = due_rows(part.run.counter, _every(rate, self.config.estimate.flux_rate), oldest)
             if due.size:
                 frames.append(self._flux(part, due))
         return frames
 
+    @property
+    def samples_per_answer(self) -> int:
+        """Every how many samples a PositionEstimate is due."""
+        return _every(self.view.sample_rate, self.config.estimate.rate)
+
     def _position(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
         e = part.estimate
         values = np.zeros((self._position_width, due.size))
-        position_values(part.run.counter, e.angle, e.sigma, e.flags, part.injecting, due, self._position_step,
-                        self._position_rows, values)
-        counters = np.arange(self._position_counter, self._position_counter + due.size)
-        self._position_counter += due.size
+        position_values(part.run.counter, e.angle, e.sigma, e.flags, part.injecting, due, self.position_step,
+                        self.position_rows, values)
+        counters = np.arange(self.position_counter, self.position_counter + due.size)
+        self.position_counter += due.size
         self.view.estimates += due.size
         return self._protocol.encode(MessageKind.POSITION_ESTIMATE, self.number, values, counters)
 
@@ -253,7 +270,7 @@ class Node:
             return 0
         every = _every(view.sample_rate, self.config.estimate.rate)
         left = every - view.sample % every
-        return -(-left // self._samples_per_frame)
+        return -(-left // self.samples_per_frame)
 
     def update_state(self, now_ns: int) -> CompanionState:
         """The state as of now, which is also what CompanionStatus says."""
@@ -373,10 +390,22 @@ class Companion:
         """
         return self.respond(self.feed(block), now_ns)
 
-    def respond(self, tracked: Sequence[Tracked], now_ns: int) -> FrameBlock:
-        """The answers to what `feed` gave, and whatever the clock makes due."""
+    def count_usual(self, block: FrameBlock, tracked: Sequence[Tracked]) -> None:
+        """Count frames that a runner dealt with itself: the samples in `tracked`, and encoder references."""
+        samples = sum(t.run.counter.size for t in tracked)
+        self.counts.frames += len(block)
+        self.counts.by_kind[_SAMPLE] += samples
+        self.counts.by_kind[MessageKind.DRIVE_REFERENCE] += len(block) - samples
+
+    def respond(self, tracked: Sequence[Tracked], now_ns: int, answered: Sequence[Tracked] = ()) -> FrameBlock:
+        """The answers to what `feed` gave, and whatever the clock makes due.
+
+        answered: samples whose PositionEstimates a runner has sent itself.
+        """
         frames: list[NDArray[np.uint8]] = []
         for number, node in self.nodes.items():
+            if answered:
+                frames += node.flux_answers([t for t in answered if t.node == number])
             if tracked:
                 frames += node.answers([t for t in tracked if t.node == number])
             frames += node.due(now_ns, self.bus_load, self.turnaround)

@@ -51,7 +51,7 @@ _SEND_NAP_S = 0.0002
 
 
 @kernel
-def _unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], frames: NDArray[np.uint8],
+def unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], frames: NDArray[np.uint8],
             raw: NDArray[np.uint8], t_ns: NDArray[np.int64], state: NDArray[np.int64]) -> int:
     """Copy n received frames out as clean rows, with their time stamps; rearm their headers.
 
@@ -104,7 +104,7 @@ def _unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], fram
     return out
 
 
-class _MessageTable:
+class MessageTable:
     """M struct mmsghdr, each pointing to one row of `frames` and, for receiving, of `control`."""
 
     def __init__(self, rows: int, control_words: int) -> None:
@@ -162,12 +162,12 @@ class SocketCanPort:
             raise
         self._handle = self._socket.fileno()
         self._rows = max_frames
-        self._in = _MessageTable(max_frames, _CONTROL_WORDS)
-        self._out = _MessageTable(max_frames, 0)
+        self._in = MessageTable(max_frames, _CONTROL_WORDS)
+        self._out = MessageTable(max_frames, 0)
         self._in_address = ctypes.c_void_p(self._in.headers.ctypes.data)
         self._state = np.zeros(4, np.int64)
         # compiled (or loaded from the cache) now and not while the first frames are waiting
-        _unpack(0, self._in.headers, self._in.control, self._in.frames,
+        unpack(0, self._in.headers, self._in.control, self._in.frames,
                 np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64), self._state)
 
     def _prepare(self, fd: bool | None, receive_own: bool, loopback: bool, receive_buffer: int,
@@ -246,6 +246,21 @@ class SocketCanPort:
         """Bytes of receive buffer the kernel granted (it doubles what was asked, for its own overhead)."""
         return self._socket.getsockopt(_SOL_SOCKET, _SO_RCVBUF)
 
+    @property
+    def tables(self) -> tuple[MessageTable, MessageTable]:
+        """The tables that recvmmsg and sendmmsg work on, for a loop that calls them itself."""
+        return self._in, self._out
+
+    @property
+    def state(self) -> NDArray[np.int64]:
+        """The state of `unpack`."""
+        return self._state
+
+    def set_timeout(self, timeout_s: float) -> None:
+        """How long a receive waits for each frame; costs a system call only when it changes."""
+        if timeout_s != self._timeout_s:
+            self._set_timeout(timeout_s)
+
     def fileno(self) -> int:
         """The socket's handle, for select and event loops."""
         return self._handle
@@ -257,8 +272,7 @@ class SocketCanPort:
         Raises ValueError for a negative or not finite timeout_s.
         """
         if timeout_s > 0.0:
-            if timeout_s != self._timeout_s:
-                self._set_timeout(timeout_s)
+            self.set_timeout(timeout_s)
             flags = _MSG_WAITFORONE if expect <= 1 else 0
         elif timeout_s == 0.0:
             flags = _MSG_DONTWAIT
@@ -271,7 +285,7 @@ class SocketCanPort:
             return FrameBlock(np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64))
         raw, t_ns = np.empty((n, FRAME_BYTES), np.uint8), np.empty(n, np.int64)
         unstamped = self._state[_S_NO_STAMP]
-        rows = _unpack(n, self._in.headers, self._in.control, self._in.frames, raw, t_ns, self._state)
+        rows = unpack(n, self._in.headers, self._in.control, self._in.frames, raw, t_ns, self._state)
         if self._state[_S_NO_STAMP] != unstamped:
             t_ns[t_ns < 0] = time.time_ns()
         return FrameBlock(raw[:rows], t_ns[:rows])

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ipmsm_can.bus import lane
 from ipmsm_can.bus.bits import BusLoad
 from ipmsm_can.companion import Companion
 from ipmsm_can.config.model import DriveConfig
@@ -39,6 +40,8 @@ def warm_up_companion(configs: Sequence[DriveConfig], protocol: Protocol) -> Non
                 load.update(part)
                 load.update(companion.respond(companion.feed(part), now))
             companion.bus_load = load.load(now)
+        if len(configs) == 1 and not fd:
+            lane.warm_up(companion)
     _set_aside()
 
 

@@ -24,6 +24,9 @@ from ipmsm_can.wire.protocol import (
 
 COMMAND_REJECTED = 1 << 5
 """Bit of DriveStatus.faults that says a command was refused since the last DriveStatus."""
+COMMANDS_MISSED = 7
+"""Largest step of a command's counter that is taken for loss.  A larger one is an old command that was held up
+somewhere; after a loss that long it costs one command more."""
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 _TEMPERATURE = 40.0
 
@@ -52,7 +55,7 @@ class DriveNode:
         self.waveform = Waveform.OFF
         self._protocol = protocol
         self._label = MessageKind.INJECTION_COMMAND * NODES + node
-        self._checker = SequenceChecker(16, 14)
+        self._checker = SequenceChecker(16, COMMANDS_MISSED)
         index = protocol.codecs[MessageKind.INJECTION_COMMAND].index
         self._rows = [index[s] for s in ("waveform", "amplitude", "frequency", "axis_angle", "time_to_live")]
         self._rate = simulation.parameters.sample_rate

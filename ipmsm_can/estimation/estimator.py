@@ -111,6 +111,12 @@ class Estimator:
             math.radians(s.valid_sigma), sample_rate)
 
     @property
+    def records(self) -> tuple[Records, ...]:
+        """Parameters and states in the order that `estimate_block` takes them."""
+        return (self._regression_parameters, self._regression, self._observer_parameters, self._observer,
+                self._speed, self._excitation, self._confidence)
+
+    @property
     def lost_locks(self) -> int:
         """How often lock was given up because the innovation did not fit."""
         return int(self._confidence["lost"][0])

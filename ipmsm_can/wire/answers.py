@@ -18,7 +18,8 @@ _TWO_PI = 2.0 * math.pi
 
 
 @kernel
-def _due(counter: NDArray[np.int64], every: int, oldest: int, out: NDArray[np.intp]) -> int:
+def due_among(counter: NDArray[np.int64], every: int, oldest: int, out: NDArray[np.intp]) -> int:
+    """Rows that are due, into out; returns how many.  See `due_rows`."""
     newest = counter[counter.shape[0] - 1]
     n = 0
     for k in range(counter.shape[0]):
@@ -31,7 +32,7 @@ def _due(counter: NDArray[np.int64], every: int, oldest: int, out: NDArray[np.in
 def due_rows(counter: NDArray[np.int64], every: int, oldest: int) -> NDArray[np.intp]:
     """Rows whose sample counter is a multiple of `every` and at most `oldest` samples behind the last one."""
     out = np.empty(counter.size, np.intp)
-    return out[:_due(counter, every, oldest, out)]
+    return out[:due_among(counter, every, oldest, out)]
 
 
 @kernel

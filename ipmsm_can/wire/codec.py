@@ -84,6 +84,17 @@ def _as_ranges(ids: Sequence[int]) -> list[tuple[int, int]]:
     return ranges
 
 
+@dataclass(frozen=True, slots=True)
+class CodecTables:
+    """Tables of a message: header word, bits of each signal, scaling, ranges, order of encoding."""
+
+    header: np.uint64
+    table: NDArray[np.int64]
+    scaling: NDArray[np.float64]
+    ranges: NDArray[np.int64]
+    order: NDArray[np.intp]
+
+
 class MessageCodec:
     """Encoder and decoder of one message; immutable, shared freely between threads.
 
@@ -154,6 +165,11 @@ class MessageCodec:
                 return depth
             s = int(self._table[s, PARENT])
         raise ValueError(f"the multiplexers of message {self.name} select each other in a circle")
+
+    @property
+    def tables(self) -> CodecTables:
+        """What `decode_block` and `encode_block` take, for kernels that call them themselves."""
+        return CodecTables(self._header, self._table, self._scaling, self._ranges, self._order)
 
     def __repr__(self) -> str:
         return (f"MessageCodec({self.name!r}, id=0x{self.frame_id:X}, length={self.length}, "

@@ -351,6 +351,11 @@ class SampleSequencer:
         return int(self.counts[COUNTERS.index(name)])
 
     @property
+    def state(self) -> NDArray[np.void]:
+        """Record array (1,) of STATE, which `sequence` works on."""
+        return self._state
+
+    @property
     def sample_rate(self) -> float:
         """Sample rate in force [Hz]; 0 while unknown."""
         return float(self._state["rate"][0])

@@ -14,10 +14,10 @@ import numpy as np
 
 from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.socketcan import SocketCanPort
+from ipmsm_can.bus.warmup import warm_up_companion
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.wire.protocol import Protocol
-from tools.bench.source import drive_frames
 
 
 def main() -> None:
@@ -31,8 +31,7 @@ def main() -> None:
     args = parser.parse_args()
     config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False},
                           "wire": {"sample_rate": args.rate} if args.told else {}})
-    warm = Companion([config], Protocol(), transmit=True)
-    warm.process(drive_frames(args.rate, 0.2, args.fd), 0)
+    warm_up_companion([config], Protocol())
     companion = Companion([config], Protocol(), transmit=not args.silent)
     stopping = False
 
