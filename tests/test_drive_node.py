@@ -212,11 +212,11 @@ def test_amplitude_is_clamped_to_the_drives_own_limit() -> None:
 
 def test_lost_commands_do_not_matter_but_a_jump_back_by_one_does() -> None:
     d = drive()
-    for counter in (0, 3, 10, 8 + 16):
+    for counter in (0, 3, 10, 1 + 16):
         hear(d, command(counter, time_to_live=40.0))
         assert obeyed(d, 300)
     assert d.rejected == 0
-    hear(d, command(7 + 16))  # 15 ahead, or one behind: a replayed older frame
+    hear(d, command(0 + 16))  # 15 ahead, or one behind: a replayed older frame
     assert d.rejected == 1
 
 
@@ -229,3 +229,13 @@ def test_frames_that_are_no_commands_are_ignored() -> None:
     hear(d, extended, short, PROTOCOL.encode(MessageKind.COMPANION_STATUS, 0, {"state": 1.0}))
     assert not obeyed(d) and d.rejected == 0
     d.receive(FrameBlock.zeros(0))
+
+
+@pytest.mark.parametrize("age", range(1, 9))
+def test_a_command_that_was_held_up_is_not_obeyed(age: int) -> None:
+    """An old "on" that comes after the "off" which was sent later."""
+    d = drive()
+    hear(d, command(20, waveform=0.0, amplitude=0.0))
+    hear(d, command(20 - age, time_to_live=40.0))
+    assert d.rejected == 1
+    assert not obeyed(d, 300)
