@@ -27,10 +27,12 @@ from ipmsm_can.wire.protocol import (
     BLOCK_SAMPLES,
     ERROR_FRAME,
     NODES,
+    PROTOCOL_VERSION,
     REMOTE_FRAME,
     UNKNOWN,
     WRONG_LENGTH,
     CompanionState,
+    DriveMode,
     MessageKind,
     ObserverKind,
     Protocol,
@@ -43,6 +45,8 @@ STALE_AFTER_NS = 50_000_000
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
 STATUS_VERSION = 1
+INJECTING, NOT_RUNNING = 1, 2
+"""Bits of what is remembered of a DriveStatus."""
 _STATUSES_KEPT = 4096
 
 _SAMPLE, _BLOCK, _TIMING, _STATUS = (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK,
@@ -93,9 +97,13 @@ class Node:
         self.scheduler = InjectionScheduler(injection_settings(config), transmit)
         self.wrong_length = 0
         self.injecting = False
+        self.running = True
+        """The drive runs, as far as it has said."""
+        self.foreign = False
+        """The drive speaks another version of the protocol."""
         self._said_at = np.zeros(0, np.int64)
-        self._said = np.zeros(1, np.bool_)
-        """Whether the drive said that it injects: entry k from after _said_at[k - 1] on."""
+        self._said = np.zeros(1, np.uint8)
+        """What the drive said, bits INJECTING and NOT_RUNNING: entry k from after _said_at[k - 1] on."""
         self.rejected_commands = 0
         self._protocol = protocol
         self._motor = config.build_motor()
@@ -110,6 +118,7 @@ class Node:
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index
         self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
+        self._mode_row, self._version_row = status["mode"], status["protocol_version"]
         position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
         self._position_width = len(position.signals)
         self.position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
@@ -127,19 +136,24 @@ class Node:
         status = rows.get(_STATUS, none)
         if status.size:
             values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
-            self._hear(block.t_ns[status], values[self._waveform_row] != 0)
+            self._hear(block.t_ns[status], values)
             self.rejected_commands = int(np.nan_to_num(values[self._rejected_row, -1]))
-        tracked = [Tracked(self.number, run, self._estimate(run), self._injected(run)) for run in runs]
+        tracked = [self._track(run) for run in runs]
         if not self.receiver.sequencer.waiting and self._said_at.size > 1:
             # Only samples from the time of the last DriveStatus on can still come.
             self._forget(int(np.searchsorted(self._said_at, self._said_at[-1], side="left")))
         return tracked
 
-    def _hear(self, t_ns: NDArray[np.int64], injecting: NDArray[np.bool_]) -> None:
+    def _hear(self, t_ns: NDArray[np.int64], status: NDArray[np.float64]) -> None:
         """Keep what DriveStatus said, and when, for the samples that come after it."""
+        injecting = status[self._waveform_row] != 0
+        self.foreign = bool(status[self._version_row, -1] != PROTOCOL_VERSION)
+        # A drive that does not switch does not apply the voltage it reports; another version means other things.
+        running = (status[self._mode_row] == DriveMode.RUNNING) & (status[self._version_row] == PROTOCOL_VERSION)
         self._said_at = np.concatenate([self._said_at, t_ns])
-        self._said = np.concatenate([self._said, injecting])
-        self.injecting = bool(self._said[-1])
+        self._said = np.concatenate([self._said, (INJECTING * injecting + NOT_RUNNING * ~running).astype(np.uint8)])
+        self.injecting = bool(self._said[-1] & INJECTING)
+        self.running = not self._said[-1] & NOT_RUNNING
         self._forget(self._said_at.size - _STATUSES_KEPT)
         set_back = np.flatnonzero(np.diff(self._said_at) < 0)
         if set_back.size:
@@ -149,21 +163,26 @@ class Node:
         if oldest > 0:
             self._said_at, self._said = self._said_at[oldest:], self._said[oldest:]
 
-    def _injected(self, run: SampleRun) -> NDArray[np.uint8]:
+    def _track(self, run: SampleRun) -> Tracked:
+        said = self._heard(run)
+        withheld = (run.doubt != 0) | (said & NOT_RUNNING != 0)
+        return Tracked(self.number, run, self._estimate(run, withheld), said & np.uint8(INJECTING))
+
+    def _heard(self, run: SampleRun) -> NDArray[np.uint8]:
         """What the last DriveStatus before each sample said: by time, so that blocks make no difference."""
         if not self._said_at.size or self._said_at[-1] < run.t_ns[0]:
             return np.full(run.t_ns.size, self._said[-1], np.uint8)
-        return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")].astype(np.uint8)
+        return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")]
 
-    def _estimate(self, run: SampleRun) -> EstimateBlock:
+    def _estimate(self, run: SampleRun, withheld: NDArray[np.bool_]) -> EstimateBlock:
         estimator = self.estimator
         if estimator is None or estimator.sample_rate != run.sample_rate:
             estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
             frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
             self.meter = meter.new_state(frequency, run.sample_rate)
         estimate = estimator.process(run.values, run.gap)
-        if run.doubt.any():
-            estimate.flags[run.doubt != 0] &= 0xFF ^ confidence.VALID
+        if withheld.any():
+            estimate.flags[withheld] &= 0xFF ^ confidence.VALID
         self.note(run, estimate, meter.meter_block(run.values, self.meter))
         return estimate
 
@@ -243,8 +262,10 @@ class Node:
                 "time_to_live": 1e3 * command.time_to_live,
             }, self._command_counter))
             self._command_counter += 1
-        if self._next_status is None or now_ns >= self._next_status:
-            self._next_status = now_ns + round(1e9 / self.config.estimate.status_rate)
+        period = round(1e9 / self.config.estimate.status_rate)
+        if self._next_status is None or not self._next_status - period < now_ns < self._next_status:
+            # Due; or the clock was set back, which must not silence us until it has caught up.
+            self._next_status = now_ns + period
             frames.append(self._status(now_ns, bus_load, turnaround))
         return frames
 
@@ -252,13 +273,13 @@ class Node:
         period = self.config.injection.period
         if self._next_command is None:
             self._next_command = now_ns
-        if now_ns < self._next_command:
+        if self._next_command - round(1e9 * period) < now_ns < self._next_command:
             return None
-        late = now_ns - self._next_command
+        late = max(0, now_ns - self._next_command)
         self._next_command = now_ns + round(period * 1e9) - min(late, round(0.5e9 * period))
         view = self.view
         return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
-                                     self._fresh(now_ns))
+                                     self._fresh(now_ns), self.running)
 
     def _fresh(self, now_ns: int) -> bool:
         return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS
@@ -280,6 +301,8 @@ class Node:
             view.state = CompanionState.WAITING_FOR_TIMING if waiting else CompanionState.WAITING_FOR_SAMPLES
         elif not self._fresh(now_ns):
             view.state = CompanionState.STALE
+        elif self.foreign:
+            view.state = CompanionState.FAULT
         elif view.flags & confidence.LOCKED:
             view.state = CompanionState.LOCKED
         elif view.sigma < math.pi:

@@ -293,7 +293,7 @@ class FastLane:
     def ready(self, now_ns: int) -> bool:
         """Whether samples flow and each answer is due within few enough of them."""
         node = self._node
-        return (node.estimator is not None and node.frames_until_due(now_ns) > 0
+        return (node.estimator is not None and node.running and node.frames_until_due(now_ns) > 0
                 and node.samples_per_answer * CYCLES <= CAPACITY // 2 and node.samples_per_frame == 1)
 
     def run(self, timeout_s: float) -> Lap:

@@ -142,10 +142,9 @@ class LiveRunner:
     def _time(self, block: FrameBlock) -> int:
         if len(block):
             self._now_ns = int(block.t_ns[-1])
-        elif self._now_ns:
-            self._now_ns += round(1e9 * IDLE_S)
         else:
-            self._now_ns = time.time_ns()
+            # Counts from zero until the first frame: an adapter may stamp by any clock.
+            self._now_ns += round(1e9 * IDLE_S)
         return self._now_ns
 
     def _time_answer(self, arrived_ns: int, answers: int = 1) -> None:

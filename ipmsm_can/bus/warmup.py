@@ -17,7 +17,14 @@ from ipmsm_can.companion import Companion
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.drive.node import DriveNode
 from ipmsm_can.frames import FrameBlock
-from ipmsm_can.wire.protocol import BLOCK_SAMPLES, MessageKind, Protocol, Waveform
+from ipmsm_can.wire.protocol import (
+    BLOCK_SAMPLES,
+    PROTOCOL_VERSION,
+    DriveMode,
+    MessageKind,
+    Protocol,
+    Waveform,
+)
 
 _RATE = 5000.0
 _SAMPLES = 420
@@ -63,7 +70,8 @@ def _frames(protocol: Protocol, node: int, begin: int, fd: bool) -> FrameBlock:
     last, one = k[-1:], np.ones(1)
     others = [
         protocol.encode(MessageKind.DRIVE_TIMING, node, {"sample_counter": last, "sample_rate": _RATE * one}),
-        protocol.encode(MessageKind.DRIVE_STATUS, node, {"mode": one, "v_dc": 300 * one}),
+        protocol.encode(MessageKind.DRIVE_STATUS, node, {"mode": DriveMode.RUNNING * one, "v_dc": 300 * one,
+                                                         "protocol_version": PROTOCOL_VERSION * one}),
         protocol.encode(MessageKind.DRIVE_REFERENCE, node, {"sample_counter": last})]
     if fd:
         starts = k[::BLOCK_SAMPLES]

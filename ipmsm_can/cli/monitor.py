@@ -46,6 +46,7 @@ REASON_WORDS = {
     InjectionReason.SPEED_HIGH_ENOUGH: "speed is high enough",
     InjectionReason.CURRENT_LIMIT: "current limit",
     InjectionReason.NO_SAMPLES: "no samples from the drive",
+    InjectionReason.DRIVE_NOT_RUNNING: "the drive does not run",
     InjectionReason.OPERATOR: "asked for by the operator",
 }
 INJECTION_WORDS = {

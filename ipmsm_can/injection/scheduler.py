@@ -80,21 +80,21 @@ class InjectionScheduler:
         self._operator = wanted
 
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
-               fresh: bool) -> Command | None:
+               fresh: bool, running: bool = True) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.
 
         elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
         electrical] of the estimate.  current: measured high-frequency current [A peak].  fresh: samples
-        are coming in.
+        are coming in.  running: the inverter applies the voltage it reports, as far as is known.
         """
         s = self.settings
         if self.state is InjectionState.DISABLED:
             return None
-        reason = self._decide(abs(omega), excitation, fresh)
+        reason = self._decide(abs(omega), excitation, fresh, running)
         target = s.amplitude * self._limit(current, elapsed) if self._wanted else 0.0
         step = s.ramp * elapsed
         before = self.amplitude
-        if not fresh:
+        if not (fresh and running):
             self.amplitude = 0.0
         elif self.amplitude < target:
             self.amplitude = min(target, self.amplitude + step)
@@ -109,12 +109,15 @@ class InjectionScheduler:
             return Command(Waveform.OFF, 0.0, s.frequency, 0.0, s.time_to_live)
         return None
 
-    def _decide(self, speed: float, excitation: float, fresh: bool) -> InjectionReason:
+    def _decide(self, speed: float, excitation: float, fresh: bool, running: bool) -> InjectionReason:
         s = self.settings
         by_excitation = s.excitation_off > 0.0
         if not fresh:
             self._wanted = False
             return InjectionReason.NO_SAMPLES
+        if not running:
+            self._wanted = False
+            return InjectionReason.DRIVE_NOT_RUNNING
         if self._operator is not None:
             self._wanted = self._operator
             return InjectionReason.OPERATOR

@@ -118,6 +118,7 @@ class InjectionReason(IntEnum):
     CURRENT_LIMIT = 6
     NO_SAMPLES = 7
     OPERATOR = 8
+    DRIVE_NOT_RUNNING = 9
 
 
 # Every signal the program reads or writes, with its width where a counter's modulus or a flag depends on it.

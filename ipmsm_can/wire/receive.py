@@ -16,6 +16,8 @@ from ipmsm_can.wire.sequence import DUPLICATES, FULL, NIBBLE, TIMING, Events, Sa
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+PLAUSIBLE = 1e6
+"""Largest current [A] and voltage [V] that is taken for a measurement."""
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 
 
@@ -103,7 +105,7 @@ class SampleReceiver:
         s = self._sample.decode_rows(words, samples)
         if self._sample_rows is not None:
             s = s[self._sample_rows]
-        samples, s = self._finite(samples, s)
+        samples, s = self._plausible(samples, s, 4)
         if not timings.size and not blocks.size:
             events = Events(np.zeros(samples.size, np.int64), s[4].astype(np.int64), np.zeros(samples.size),
                             block.t_ns[samples], s[:4])
@@ -111,7 +113,7 @@ class SampleReceiver:
         t = self._timing.decode_rows(words, timings)
         if self._timing_rows is not None:
             t = t[self._timing_rows]
-        timings, t = self._finite(timings, t)
+        timings, t = self._plausible(timings, t, 0)
         blocks, b = self._intact_blocks(block, blocks)
         room = samples.size + timings.size + BLOCK_SAMPLES * blocks.size
         kind = np.empty(room, np.int64)
@@ -123,11 +125,15 @@ class SampleReceiver:
         return self.sequencer.push(Events(kind[:n], counter[:n], rate[:n], t_ns[:n],
                                           values if n == room else np.ascontiguousarray(values[:, :n])))
 
-    def _finite(self, rows: Rows, values: Floats) -> tuple[Rows, Floats]:
-        """Without the frames that hold a NaN or an infinity (possible in somebody's float signals)."""
-        if math.isfinite(values.sum()):
+    def _plausible(self, rows: Rows, values: Floats, measured: int) -> tuple[Rows, Floats]:
+        """Without the frames that hold a NaN, an infinity, or beyond PLAUSIBLE in their first `measured` rows.
+
+        Only somebody's float signals or scalings can hold such a thing; it would spoil the filters for good.
+        """
+        largest = np.abs(values[:measured]).max(initial=0.0)
+        if math.isfinite(values.sum()) and largest <= PLAUSIBLE:
             return rows, values
-        good = np.isfinite(values).all(axis=0)
+        good = np.isfinite(values).all(axis=0) & (np.abs(values[:measured]) <= PLAUSIBLE).all(axis=0)
         self.bad_frames += int(good.size - good.sum())
         return rows[good], np.ascontiguousarray(values[:, good])
 
@@ -143,6 +149,7 @@ class SampleReceiver:
         self.bad_frames -= int(repeated.sum())
         good = status <= E2EStatus.OK_SOME_LOST
         good &= np.isfinite(b).all(axis=0) & (b[1] >= 1) & (b[1] <= BLOCK_SAMPLES)
+        good &= (np.abs(b[2:]) <= PLAUSIBLE).all(axis=0)
         if good.all():
             return rows, np.ascontiguousarray(b)
         self.bad_frames += int(good.size - good.sum())

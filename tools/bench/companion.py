@@ -1,4 +1,4 @@
-"""The companion as the measurements on a bus run it: `python -m tools.bench.companion vcan0 [--fd]`.
+"""The companion as the measurements on a bus run it: `python -m tools.bench.companion vcan0`.
 
 The same LiveRunner, Companion and port as `ipmsm-can run --transmit`, without the display.  Ends on SIGTERM and
 prints frames received, estimates sent, samples lost, kernel drops, and its own turnaround quantiles.
@@ -24,13 +24,9 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("channel")
-    parser.add_argument("--fd", action="store_true")
-    parser.add_argument("--rate", type=float, default=5000.0)
-    parser.add_argument("--told", action="store_true", help="take the sample rate from the configuration")
     parser.add_argument("--silent", action="store_true", help="only listen")
     args = parser.parse_args()
-    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False},
-                          "wire": {"sample_rate": args.rate} if args.told else {}})
+    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False}})
     warm_up_companion([config], Protocol())
     companion = Companion([config], Protocol(), transmit=not args.silent)
     stopping = False

@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import socket
-import struct
 import time
 
 import numpy as np
@@ -19,9 +18,7 @@ from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import CANFD_FDF, FrameBlock
 from ipmsm_can.motor import M2
-from ipmsm_can.wire.protocol import MessageKind, Protocol
-
-SAMPLE_ID = 0x100
+from ipmsm_can.wire.protocol import Protocol
 
 
 def drive_frames(rate: float, seconds: float, fd: bool) -> FrameBlock:
@@ -73,43 +70,6 @@ class Sender:
         return sent
 
 
-def periodic_frames(rate: float) -> FrameBlock:
-    """256 samples that hold a whole number of turns, so that they may be sent over and over: DriveSample only."""
-    n, turns = 256, 3
-    angle = 2.0 * np.pi * turns * np.arange(n) / n
-    omega = 2.0 * np.pi * turns * rate / n
-    i = 2.0j * np.exp(1j * angle)
-    flux = M2.psi_m * np.exp(1j * angle) + M2.L_q * i
-    step = np.exp(-1j * omega / rate)
-    v = flux * (1.0 - step) * rate + M2.R * i * (1.0 - step) / (1j * omega) * rate
-    return FrameBlock(Protocol().encode(MessageKind.DRIVE_SAMPLE, 0, {
-        "i_alpha": i.real, "i_beta": i.imag, "v_alpha": v.real, "v_beta": v.imag,
-        "sample_counter": np.arange(n) & 15}), np.zeros(n, np.int64))
-
-
-class KernelSender:
-    """The kernel itself sends, one sample each 1/rate, by its broadcast manager: no process wakes up for it."""
-
-    _SETUP, _DELETE, _SETTIMER, _STARTTIMER = 1, 2, 1, 2
-
-    def __init__(self, channel: str, frames: FrameBlock, rate: float) -> None:
-        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_DGRAM, socket.CAN_BCM)
-        self._socket.connect((channel,))
-        self._frames = frames.raw[:, :16].tobytes()
-        self._n = len(frames)
-        self._period_us = round(1e6 / rate)
-
-    def _head(self, opcode: int, flags: int, n: int) -> bytes:
-        return struct.pack("@IIIllllII0q", opcode, flags, 0, 0, 0, 0, self._period_us, SAMPLE_ID, n)
-
-    def run(self, seconds: float) -> int:
-        """Let it send for so long; returns how many frames that should have been."""
-        self._socket.send(self._head(self._SETUP, self._SETTIMER | self._STARTTIMER, self._n) + self._frames)
-        time.sleep(seconds)
-        self._socket.send(self._head(self._DELETE, 0, 0))
-        return round(1e6 * seconds / self._period_us)
-
-
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -118,14 +78,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--fd", action="store_true")
     parser.add_argument("--tick", type=float, default=0.0)
-    parser.add_argument("--kernel", action="store_true", help="let the kernel's broadcast manager send")
     args = parser.parse_args()
-    if args.kernel:
-        by_kernel = KernelSender(args.channel, periodic_frames(args.rate), args.rate)
-        print("ready", flush=True)
-        input()
-        print(by_kernel.run(args.seconds), flush=True)
-        return
     sender = Sender(args.channel, drive_frames(args.rate, args.seconds, args.fd), args.tick)
     print("ready", flush=True)
     input()
