@@ -413,12 +413,13 @@ class Companion:
         """
         return self.respond(self.feed(block), now_ns)
 
-    def count_usual(self, block: FrameBlock, tracked: Sequence[Tracked]) -> None:
-        """Count frames that a runner dealt with itself: the samples in `tracked`, and encoder references."""
+    def count_usual(self, block: FrameBlock, tracked: Sequence[Tracked], timings: int) -> None:
+        """Count frames that a runner dealt with itself: the samples in `tracked`, timings, encoder references."""
         samples = sum(t.run.counter.size for t in tracked)
         self.counts.frames += len(block)
         self.counts.by_kind[_SAMPLE] += samples
-        self.counts.by_kind[MessageKind.DRIVE_REFERENCE] += len(block) - samples
+        self.counts.by_kind[_TIMING] += timings
+        self.counts.by_kind[MessageKind.DRIVE_REFERENCE] += len(block) - samples - timings
 
     def respond(self, tracked: Sequence[Tracked], now_ns: int, answered: Sequence[Tracked] = ()) -> FrameBlock:
         """The answers to what `feed` gave, and whatever the clock makes due.

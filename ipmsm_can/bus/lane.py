@@ -27,12 +27,12 @@ from ipmsm_can.injection.meter import meter_block
 from ipmsm_can.wire.answers import due_among, position_values
 from ipmsm_can.wire.e2e import crc_p02
 from ipmsm_can.wire.kernels import FLOAT, KIND, PARENT, decode_block, encode_block
-from ipmsm_can.wire.protocol import MessageKind
-from ipmsm_can.wire.sequence import HALF_WRAP, SampleRun, sequence
+from ipmsm_can.wire.protocol import InjectionState, MessageKind
+from ipmsm_can.wire.sequence import HALF_WRAP, NIBBLE, TIMING, SampleRun, sequence
 
-CYCLES = 10
-"""Answers given before Python sees what happened."""
-CAPACITY = 2048
+CYCLES, CYCLES_PROBING = 50, 10
+"""Answers given before Python sees what happened; fewer while it has probing commands to send."""
+CAPACITY = 4096
 """Frames, and samples, that one call can take in."""
 _MOST = 64
 
@@ -54,28 +54,35 @@ _ESTIMATES = regression.ROWS + ges.ROWS + speed.ROWS + 3
 
 
 @kernel
-def _unbroken(words: Words, t_ns: Ints, rows: Rows, n: int, counter_shift: int, st: Any) -> bool:
-    """Whether these samples follow the last one, each other, and the clock, with nothing to be settled."""
+def _unbroken(kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, n: int, st: Any) -> bool:
+    """Whether these samples follow the last one, each other, and the clock, with nothing to be settled, and any
+    DriveTiming among them only says what is known."""
     if not st.has_last or st.restarted or st.correction != 0 or st.doubt or st.guess != 0 or st.rate <= 0.0:
         return False
     if st.has_floor and st.floor > st.last + 1:
         return False
     before = st.last_t
+    last = st.last
     for k in range(n):
-        r = rows[k]
-        nibble = np.int64((words[r, 1] >> np.uint64(counter_shift)) & np.uint64(15))
-        silence = (t_ns[r] - before) * 1e-9 * st.rate
-        if nibble != ((st.last + 1 + k) & 15) or silence < 0.0 or silence > HALF_WRAP:
+        if kind[k] == TIMING:
+            ahead = (counter[k] - last) & 0xFFFFFFFF
+            if not st.synced or rate[k] != st.rate or 0 < ahead <= 0xFFFFFFF0:
+                return False
+            continue
+        silence = (t_ns[k] - before) * 1e-9 * st.rate
+        if counter[k] != ((last + 1) & 15) or silence < 0.0 or silence > HALF_WRAP:
             return False
-        before = t_ns[r]
+        last += 1
+        before = t_ns[k]
     return True
 
 
 @kernel
-def _lane(handle: int, every: int, ids: Words, counter_shift: int,
+def _lane(handle: int, cycles: int, every: int, ids: Words,
           in_headers: Ints, in_address: int, control: Ints, in_frames: Bytes, port_state: Ints,
           raw: Bytes, words: Words, t_ns: Ints,
-          n_words: int, table: Ints, scaling: Floats, ranges: Ints, order: Rows,
+          table: Ints, scaling: Floats, ranges: Ints, order: Rows,
+          t_table: Ints, t_scaling: Floats, t_ranges: Ints, t_order: Rows,
           seq: Records, counts: Ints,
           rp: Records, rs: Records, op: Records, os: Records, sp: Records, ex: Records, cf: Records, mt: Records,
           injecting: int, step: float, position_rows: Rows,
@@ -86,13 +93,13 @@ def _lane(handle: int, every: int, ids: Words, counter_shift: int,
     """Serve up to CYCLES answers; returns why it stopped.
 
     result: frames taken in, samples estimated, frames in raw that were left, answers sent, answers not taken (in
-    out_frames from row result[5] on), first such row, counter of the next answer, samples among the frames.
+    out_frames from row result[5] on), first such row, counter of the next answer, DriveTimings taken in.
     """
     st = seq[0]
     taken = 0
     done = 0
     hf = 0.0
-    for _cycle in range(CYCLES):
+    for _cycle in range(cycles):
         want = every - st.last % every
         n = _recvmmsg(handle, in_address, min(want, _MOST), 0, 0)
         if n <= 0:
@@ -101,18 +108,39 @@ def _lane(handle: int, every: int, ids: Words, counter_shift: int,
             estimates[_ESTIMATES - 1, 0] = hf
             return SILENCE
         n = unpack(n, in_headers, control, in_frames, raw, t_ns, port_state)
-        rows = np.empty(n, np.intp)
-        m = 0
         strange = False
+        events = 0
+        m = 0
+        kind = np.empty(n, np.int64)
+        low = np.empty(n, np.int64)
+        rate = np.zeros(n)
+        arrived = np.empty(n, np.int64)
+        part = np.zeros((4, n))
+        row = np.empty(1, np.intp)
+        one = np.empty((table.shape[0], 1))
+        timing = np.empty((t_table.shape[0], 1))
         for k in range(n):
+            row[0] = k
+            arrived[events] = t_ns[k]
             if t_ns[k] < 0:
                 strange = True
-            if words[k, 0] == ids[0]:
-                rows[m] = k
+            elif words[k, 0] == ids[0]:
+                decode_block(words, row, True, 1, table, scaling, ranges, one)
+                for r in range(4):
+                    part[r, events] = one[order[r], 0]
+                kind[events] = NIBBLE
+                low[events] = np.int64(one[order[4], 0])
+                events += 1
                 m += 1
+            elif words[k, 0] == ids[2]:
+                decode_block(words, row, True, 1, t_table, t_scaling, t_ranges, timing)
+                kind[events] = TIMING
+                low[events] = np.int64(timing[t_order[0], 0])
+                rate[events] = timing[t_order[1], 0]
+                events += 1
             elif words[k, 0] != ids[1]:
                 strange = True
-        if strange or not _unbroken(words, t_ns, rows, m, counter_shift, st):
+        if strange or not _unbroken(kind, low, rate, arrived, events, st):
             result[0] = taken
             result[1] = done
             result[2] = n
@@ -123,28 +151,17 @@ def _lane(handle: int, every: int, ids: Words, counter_shift: int,
                 all_raw[taken + k, b] = raw[k, b]
             all_t[taken + k] = t_ns[k]
         taken += n
-        if m == 0:
-            continue
-        decoded = np.empty((table.shape[0], m))
-        decode_block(words, rows[:m], True, n_words, table, scaling, ranges, decoded)
-        part = np.empty((4, m))
-        kind = np.zeros(m, np.int64)
-        nibble = np.empty(m, np.int64)
-        rate = np.zeros(m)
-        arrived = np.empty(m, np.int64)
-        for k in range(m):
-            for r in range(4):
-                part[r, k] = decoded[order[r], k]
-            nibble[k] = np.int64(decoded[order[4], k])
-            arrived[k] = t_ns[rows[k]]
         run_counter = np.empty(m, np.int64)
         run_values = np.empty((4, m))
         run_filled = np.empty(m, np.uint8)
         run_doubt = np.empty(m, np.uint8)
         run_gap = np.empty(m, np.int64)
         run_t = np.empty(m, np.int64)
-        sequence(0, kind, nibble, rate, arrived, part, 0, seq, counts, run_counter, run_values, run_filled,
-                 run_doubt, run_gap, run_t)
+        sequence(0, kind[:events], low[:events], rate[:events], arrived[:events], part, 0, seq, counts, run_counter,
+                 run_values, run_filled, run_doubt, run_gap, run_t)
+        result[7] += events - m
+        if m == 0:
+            continue
         regressed = np.empty((7, m))
         flux = np.empty((6, m))
         angle = np.empty((3, m))
@@ -201,11 +218,13 @@ def _lane(handle: int, every: int, ids: Words, counter_shift: int,
 class Lap:
     """What one call did: frames taken in, samples with their estimates, and what is left to the ordinary path.
 
-    taken: frames that are dealt with.  tracked: their samples, empty or one.  left: frames not dealt with.
+    taken: frames that are dealt with, `timings` DriveTimings among them.  tracked: their samples, empty or one.
+     left: frames not dealt with.
     unsent: answers that the port would not take.  sent: answers sent.
     """
 
     taken: FrameBlock
+    timings: int
     tracked: list[Tracked]
     left: FrameBlock
     unsent: FrameBlock
@@ -259,9 +278,10 @@ class FastLane:
         position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
         reference = protocol.codecs[MessageKind.DRIVE_REFERENCE]
         number = self._node.number
-        self._ids = np.array([c.frame_id + number | c.length << 32 for c in (sample, reference)], np.uint64)
-        self._shift = sample.layouts[sample.index["sample_counter"]].start
-        self._sample, self._position = sample.tables, position.tables
+        timing = protocol.codecs[MessageKind.DRIVE_TIMING]
+        self._ids = np.array([c.frame_id + number | c.length << 32 for c in (sample, reference, timing)], np.uint64)
+        self._sample, self._position, self._timing = sample.tables, position.tables, timing.tables
+        self._timing_order = np.array([timing.index["sample_counter"], timing.index["sample_rate"]], np.intp)
         self._order = np.array([sample.index[s] for s in (
             "i_alpha", "i_beta", "v_alpha", "v_beta", "sample_counter")], np.intp)
         self._header = np.uint64(int(position.tables.header) + number)
@@ -285,7 +305,9 @@ class FastLane:
         codec = companion.protocol.codecs[MessageKind.DRIVE_SAMPLE]
         counter = codec.layouts[codec.index["sample_counter"]]
         table = codec.tables.table
-        simple = (codec.length == 8 and not codec.is_fd and not counter.motorola and counter.scale == 1.0
+        timing = companion.protocol.codecs[MessageKind.DRIVE_TIMING]
+        simple = (timing.length == 8 and not timing.is_fd and (timing.tables.table[:, PARENT] < 0).all()
+                  and codec.length == 8 and not codec.is_fd and not counter.motorola and counter.scale == 1.0
                   and counter.offset == 0.0 and (table[:, KIND] != FLOAT).all() and (table[:, PARENT] < 0).all()
                   and companion.protocol.codecs[MessageKind.POSITION_ESTIMATE].length == 8)
         return cls(port, companion) if simple else None
@@ -294,7 +316,7 @@ class FastLane:
         """Whether samples flow and each answer is due within few enough of them."""
         node = self._node
         return (node.estimator is not None and node.running and node.frames_until_due(now_ns) > 0
-                and node.samples_per_answer * CYCLES <= CAPACITY // 2 and node.samples_per_frame == 1)
+                and min(node.samples_per_answer, _MOST) * CYCLES <= CAPACITY and node.samples_per_frame == 1)
 
     def run(self, timeout_s: float) -> Lap:
         """Serve until there is something for Python to do, at most CYCLES answers; waits timeout_s per frame."""
@@ -306,12 +328,14 @@ class FastLane:
         incoming, outgoing = port.tables
         result = np.zeros(8, np.int64)
         result[6] = node.position_counter
-        s, p = self._sample, self._position
+        s, p, t = self._sample, self._position, self._timing
+        probing = node.scheduler.state not in (InjectionState.DISABLED, InjectionState.OFF)
         rp, rs, op, os, sp, ex, cf = estimator.records
-        why = _lane(port.fileno(), node.samples_per_answer, self._ids, self._shift,
+        why = _lane(port.fileno(), CYCLES_PROBING if probing else CYCLES, node.samples_per_answer, self._ids,
                     incoming.headers, incoming.headers.ctypes.data, incoming.control, incoming.frames, port.state,
                     self._raw, self._raw.view(np.uint64), self._t,
-                    1, s.table, s.scaling, s.ranges, self._order,
+                    s.table, s.scaling, s.ranges, self._order,
+                    t.table, t.scaling, t.ranges, self._timing_order,
                     node.receiver.sequencer.state, node.receiver.sequencer.counts,
                     rp, rs, op, os, sp, ex, cf, node.meter,
                     int(node.injecting), node.position_step, node.position_rows,
@@ -322,7 +346,7 @@ class FastLane:
         node.position_counter = int(result[6])
         node.view.estimates += sent + unsent
         frames = FrameBlock(self._all_raw[:taken].copy(), self._all_t[:taken].copy())
-        return Lap(frames, self._tracked(done) if done else [],
+        return Lap(frames, int(result[7]), self._tracked(done) if done else [],
                    FrameBlock(self._raw[:left].copy(), self._t[:left].copy()) if why == STRANGE else _NOTHING,
                    FrameBlock(outgoing.frames[first:first + unsent].copy(), np.zeros(unsent, np.int64)), sent)
 

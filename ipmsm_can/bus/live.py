@@ -105,7 +105,7 @@ class LiveRunner:
         unstamped = lap.left.t_ns < 0
         if unstamped.any():
             lap.left.t_ns[unstamped] = time.time_ns()
-        companion.count_usual(lap.taken, lap.tracked)
+        companion.count_usual(lap.taken, lap.tracked, lap.timings)
         now = self._time(lap.left if len(lap.left) else lap.taken)
         tracked = companion.feed(lap.left)
         answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now, lap.tracked)])

@@ -4,7 +4,8 @@
     loop   python-can and cantools: recv, decode each sample, encode and send an answer for every n-th
     recv   python-can's recv alone, nothing else
 
-Run as a process: `python -m tools.bench.rivals echo vcan0 5`, to answer every fifth sample.  Ends on SIGTERM and prints the frames received.
+Run as a process: `python -m tools.bench.rivals echo vcan0 5`, to answer every fifth sample.
+  Ends on SIGTERM and prints the frames received.
 """
 
 from __future__ import annotations
