@@ -6,7 +6,6 @@ comes back.  Bad input never raises: it is dropped, counted, and shown in Compan
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -14,320 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.config.build import estimator_settings, injection_settings
 from ipmsm_can.config.model import DriveConfig
-from ipmsm_can.estimation import confidence, speed
-from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
-from ipmsm_can.estimation.observers import ges
 from ipmsm_can.frames import CAN_SFF_MASK, FrameBlock
-from ipmsm_can.injection import meter
-from ipmsm_can.injection.scheduler import Command, InjectionScheduler
-from ipmsm_can.wire.answers import POSITION_SIGNALS, due_rows, position_values
+from ipmsm_can.node import Node, Tracked
 from ipmsm_can.wire.protocol import (
-    BLOCK_SAMPLES,
     ERROR_FRAME,
     NODES,
-    PROTOCOL_VERSION,
     REMOTE_FRAME,
     UNKNOWN,
     WRONG_LENGTH,
-    CompanionState,
-    DriveMode,
     MessageKind,
-    ObserverKind,
     Protocol,
 )
-from ipmsm_can.wire.receive import SampleReceiver
-from ipmsm_can.wire.sequence import SampleRun
-
-STALE_AFTER_NS = 50_000_000
-"""Silence of the drive [ns] after which nothing is claimed any more."""
-OLDEST_ANSWER = 0.02
-"""An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
-STATUS_VERSION = 1
-INJECTING, NOT_RUNNING = 1, 2
-"""Bits of what is remembered of a DriveStatus."""
-_STATUSES_KEPT = 4096
-
-_SAMPLE, _BLOCK, _TIMING, _STATUS = (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK,
-                                     MessageKind.DRIVE_TIMING, MessageKind.DRIVE_STATUS)
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """Samples of one node and what was estimated from them.
-
-    injecting (M,): uint8, 1 where the drive said that it injects.
-    """
-
-    node: int
-    run: SampleRun
-    estimate: EstimateBlock
-    injecting: NDArray[np.uint8]
-
-
-@dataclass(slots=True)
-class NodeView:
-    """The latest of one node, for displays: NaN or 0 before the first estimate.
-
-    theta [rad electrical], omega [rad/s electrical], sigma [rad electrical], excitation [V^2 s],
-    hf_current: high-frequency current [A peak]; flags: bits of `confidence`.
-    """
-
-    sample: int = 0
-    sample_rate: float = 0.0
-    theta: float = math.nan
-    omega: float = 0.0
-    sigma: float = math.pi
-    excitation: float = 0.0
-    hf_current: float = 0.0
-    flags: int = 0
-    state: CompanionState = CompanionState.WAITING_FOR_SAMPLES
-    estimates: int = 0
-
-
-class Node:
-    """One drive: its wire, its estimator, its injection."""
-
-    def __init__(self, protocol: Protocol, config: DriveConfig, transmit: bool) -> None:
-        self.config = config
-        self.number = config.wire.node
-        self.view = NodeView()
-        self.receiver = SampleReceiver(protocol, self.number, config.wire.max_gap, config.wire.sample_rate)
-        self.scheduler = InjectionScheduler(injection_settings(config), transmit)
-        self.wrong_length = 0
-        self.injecting = False
-        self.running = True
-        """The drive runs, as far as it has said."""
-        self.foreign = False
-        """The drive speaks another version of the protocol."""
-        self._said_at = np.zeros(0, np.int64)
-        self._said = np.zeros(1, np.uint8)
-        """What the drive said, bits INJECTING and NOT_RUNNING: entry k from after _said_at[k - 1] on."""
-        self.rejected_commands = 0
-        self._protocol = protocol
-        self._motor = config.build_motor()
-        self._settings = estimator_settings(config)
-        self.estimator: Estimator | None = None
-        self.meter = meter.new_state(config.injection.frequency, 1.0)
-        self._last_arrival: int | None = None
-        self.samples_per_frame = 1
-        self._next_status: int | None = None
-        self._next_command: int | None = None
-        self.position_counter = 0
-        self._command_counter = 0
-        status = protocol.codecs[_STATUS].index
-        self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
-        self._mode_row, self._version_row = status["mode"], status["protocol_version"]
-        position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
-        self._position_width = len(position.signals)
-        self.position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
-        self.position_step = position.layouts[position.index["theta_e"]].scale
-
-    # Frames in
-
-    def feed(self, block: FrameBlock, rows: dict[MessageKind, NDArray[np.intp]]) -> list[Tracked]:
-        """Take in this node's frames (row numbers by kind) and estimate from the samples they complete."""
-        none = _NO_ROWS
-        blocks = rows.get(_BLOCK, none)
-        runs = self.receiver.push(block, rows.get(_SAMPLE, none), rows.get(_TIMING, none), blocks)
-        if runs:
-            self.samples_per_frame = BLOCK_SAMPLES if blocks.size else 1
-        status = rows.get(_STATUS, none)
-        if status.size:
-            values, _, _ = self._protocol.decode(_STATUS, self.number, block.raw, status)
-            self._hear(block.t_ns[status], values)
-            self.rejected_commands = int(np.nan_to_num(values[self._rejected_row, -1]))
-        tracked = [self._track(run) for run in runs]
-        if not self.receiver.sequencer.waiting and self._said_at.size > 1:
-            # Only samples from the time of the last DriveStatus on can still come.
-            self._forget(int(np.searchsorted(self._said_at, self._said_at[-1], side="left")))
-        return tracked
-
-    def _hear(self, t_ns: NDArray[np.int64], status: NDArray[np.float64]) -> None:
-        """Keep what DriveStatus said, and when, for the samples that come after it."""
-        injecting = status[self._waveform_row] != 0
-        self.foreign = bool(status[self._version_row, -1] != PROTOCOL_VERSION)
-        # A drive that does not switch does not apply the voltage it reports; another version means other things.
-        running = (status[self._mode_row] == DriveMode.RUNNING) & (status[self._version_row] == PROTOCOL_VERSION)
-        self._said_at = np.concatenate([self._said_at, t_ns])
-        self._said = np.concatenate([self._said, (INJECTING * injecting + NOT_RUNNING * ~running).astype(np.uint8)])
-        self.injecting = bool(self._said[-1] & INJECTING)
-        self.running = not self._said[-1] & NOT_RUNNING
-        self._forget(self._said_at.size - _STATUSES_KEPT)
-        set_back = np.flatnonzero(np.diff(self._said_at) < 0)
-        if set_back.size:
-            self._forget(int(set_back[-1]) + 1)
-
-    def _forget(self, oldest: int) -> None:
-        if oldest > 0:
-            self._said_at, self._said = self._said_at[oldest:], self._said[oldest:]
-
-    def _track(self, run: SampleRun) -> Tracked:
-        said = self._heard(run)
-        withheld = (run.doubt != 0) | (said & NOT_RUNNING != 0)
-        return Tracked(self.number, run, self._estimate(run, withheld), said & np.uint8(INJECTING))
-
-    def _heard(self, run: SampleRun) -> NDArray[np.uint8]:
-        """What the last DriveStatus before each sample said: by time, so that blocks make no difference."""
-        if not self._said_at.size or self._said_at[-1] < run.t_ns[0]:
-            return np.full(run.t_ns.size, self._said[-1], np.uint8)
-        return self._said[np.searchsorted(self._said_at, run.t_ns, side="left")]
-
-    def _estimate(self, run: SampleRun, withheld: NDArray[np.bool_]) -> EstimateBlock:
-        estimator = self.estimator
-        if estimator is None or estimator.sample_rate != run.sample_rate:
-            estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
-            frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
-            self.meter = meter.new_state(frequency, run.sample_rate)
-        estimate = estimator.process(run.values, run.gap)
-        if withheld.any():
-            estimate.flags[withheld] &= 0xFF ^ confidence.VALID
-        self.note(run, estimate, meter.meter_block(run.values, self.meter))
-        return estimate
-
-    def note(self, run: SampleRun, estimate: EstimateBlock, hf_current: float) -> None:
-        """Keep the newest of these samples as the view; hf_current [A peak]."""
-        view = self.view
-        view.hf_current = hf_current
-        view.sample = int(run.counter[-1])
-        view.sample_rate = run.sample_rate
-        view.theta = float(estimate.angle[speed.THETA_HAT, -1])
-        view.omega = float(estimate.angle[speed.OMEGA, -1])
-        view.sigma = float(estimate.sigma[-1])
-        view.excitation = float(estimate.excitation[-1])
-        view.flags = int(estimate.flags[-1])
-        self._last_arrival = int(run.t_ns[-1])
-
-    # Frames out
-
-    def answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
-        """PositionEstimate and ActiveFluxEstimate frames for the samples that are due, newest last."""
-        frames = []
-        for part in tracked:
-            counter, rate = part.run.counter, part.run.sample_rate
-            oldest = int(OLDEST_ANSWER * rate)
-            due = due_rows(counter, _every(rate, self.config.estimate.rate), oldest)
-            if due.size:
-                frames.append(self._position(part, due))
-        return frames + self.flux_answers(tracked)
-
-    def flux_answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
-        """ActiveFluxEstimate frames for the samples that are due."""
-        frames = []
-        for part in tracked:
-            rate = part.run.sample_rate
-            oldest = int(OLDEST_ANSWER * rate)
-            due = due_rows(part.run.counter, _every(rate, self.config.estimate.flux_rate), oldest)
-            if due.size:
-                frames.append(self._flux(part, due))
-        return frames
-
-    @property
-    def samples_per_answer(self) -> int:
-        """Every how many samples a PositionEstimate is due."""
-        return _every(self.view.sample_rate, self.config.estimate.rate)
-
-    def _position(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
-        e = part.estimate
-        values = np.zeros((self._position_width, due.size))
-        position_values(part.run.counter, e.angle, e.sigma, e.flags, part.injecting, due, self.position_step,
-                        self.position_rows, values)
-        counters = np.arange(self.position_counter, self.position_counter + due.size)
-        self.position_counter += due.size
-        self.view.estimates += due.size
-        return self._protocol.encode(MessageKind.POSITION_ESTIMATE, self.number, values, counters)
-
-    def _flux(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
-        e = part.estimate
-        phi = np.hypot(e.regression[1, due], e.regression[2, due])
-        innovation = e.flux[ges.INNOVATION, due]
-        return self._protocol.encode(MessageKind.ACTIVE_FLUX_ESTIMATE, self.number, {
-            "x_alpha": e.flux[ges.X_A, due],
-            "x_beta": e.flux[ges.X_B, due],
-            "excitation_level": 10.0 * np.log10(np.maximum(e.excitation[due], 1e-30)),
-            "innovation": np.divide(innovation, phi, out=np.zeros(due.size), where=phi > 0.0),
-        })
-
-    def due(self, now_ns: int, bus_load: float, turnaround: float) -> list[NDArray[np.uint8]]:
-        """InjectionCommand and CompanionStatus frames that are due by the clock."""
-        frames = []
-        command = self._command(now_ns)
-        if command is not None:
-            frames.append(self._protocol.encode(MessageKind.INJECTION_COMMAND, self.number, {
-                "waveform": float(command.waveform), "amplitude": command.amplitude,
-                "frequency": command.frequency,
-                "axis_angle": self._protocol.angle(MessageKind.INJECTION_COMMAND, "axis_angle",
-                                                   command.axis_angle),
-                "time_to_live": 1e3 * command.time_to_live,
-            }, self._command_counter))
-            self._command_counter += 1
-        period = round(1e9 / self.config.estimate.status_rate)
-        if self._next_status is None or not self._next_status - period < now_ns < self._next_status:
-            # Due; or the clock was set back, which must not silence us until it has caught up.
-            self._next_status = now_ns + period
-            frames.append(self._status(now_ns, bus_load, turnaround))
-        return frames
-
-    def _command(self, now_ns: int) -> Command | None:
-        period = self.config.injection.period
-        if self._next_command is None:
-            self._next_command = now_ns
-        if self._next_command - round(1e9 * period) < now_ns < self._next_command:
-            return None
-        late = max(0, now_ns - self._next_command)
-        self._next_command = now_ns + round(period * 1e9) - min(late, round(0.5e9 * period))
-        view = self.view
-        return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
-                                     self._fresh(now_ns), self.running)
-
-    def _fresh(self, now_ns: int) -> bool:
-        return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS
-
-    def frames_until_due(self, now_ns: int) -> int:
-        """Sample frames to come up to the next one that gets a PositionEstimate; 0 while samples do not flow."""
-        view = self.view
-        if view.sample_rate <= 0.0 or not self._fresh(now_ns):
-            return 0
-        every = _every(view.sample_rate, self.config.estimate.rate)
-        left = every - view.sample % every
-        return -(-left // self.samples_per_frame)
-
-    def update_state(self, now_ns: int) -> CompanionState:
-        """The state as of now, which is also what CompanionStatus says."""
-        view = self.view
-        if self._last_arrival is None:
-            waiting = self.receiver.sequencer.waiting
-            view.state = CompanionState.WAITING_FOR_TIMING if waiting else CompanionState.WAITING_FOR_SAMPLES
-        elif not self._fresh(now_ns):
-            view.state = CompanionState.STALE
-        elif self.foreign:
-            view.state = CompanionState.FAULT
-        elif view.flags & confidence.LOCKED:
-            view.state = CompanionState.LOCKED
-        elif view.sigma < math.pi:
-            view.state = CompanionState.TRACKING
-        else:
-            view.state = CompanionState.STARTING
-        return view.state
-
-    @property
-    def bad_frames(self) -> int:
-        """Frames of this node that were dropped: wrong length, wrong CRC, impossible content."""
-        return self.wrong_length + self.receiver.bad_frames + self.receiver.sequencer.count("bad_rate")
-
-    def _status(self, now_ns: int, bus_load: float, turnaround: float) -> NDArray[np.uint8]:
-        return self._protocol.encode(MessageKind.COMPANION_STATUS, self.number, {
-            "state": float(self.update_state(now_ns)),
-            "observer": float(ObserverKind[self._settings.kind.upper()]),
-            "injection_state": float(self.scheduler.state),
-            "injection_reason": float(self.scheduler.reason),
-            "bus_load": 100.0 * bus_load,
-            "lost_samples": self.receiver.sequencer.count("lost") & 0xFFF,
-            "bad_frames": self.bad_frames & 0x3FF,
-            "turnaround": 1e6 * turnaround,
-            "version": float(STATUS_VERSION),
-        })
 
 
 @dataclass(slots=True)
@@ -417,8 +114,8 @@ class Companion:
         """Count frames that a runner dealt with itself: the samples in `tracked`, timings, encoder references."""
         samples = sum(t.run.counter.size for t in tracked)
         self.counts.frames += len(block)
-        self.counts.by_kind[_SAMPLE] += samples
-        self.counts.by_kind[_TIMING] += timings
+        self.counts.by_kind[MessageKind.DRIVE_SAMPLE] += samples
+        self.counts.by_kind[MessageKind.DRIVE_TIMING] += timings
         self.counts.by_kind[MessageKind.DRIVE_REFERENCE] += len(block) - samples - timings
 
     def respond(self, tracked: Sequence[Tracked], now_ns: int, answered: Sequence[Tracked] = ()) -> FrameBlock:
@@ -439,11 +136,6 @@ class Companion:
         return FrameBlock(raw, np.full(raw.shape[0], now_ns, np.int64))
 
 
-def _every(sample_rate: float, rate: float) -> int:
-    """Every how many samples something with this rate [Hz] falls due."""
-    return max(1, round(sample_rate / rate))
-
-
 @kernel
 def group_rows(labels: NDArray[np.int16], order: NDArray[np.intp], begin: NDArray[np.intp]) -> None:
     """Sort rows by label, in order of arrival within each: rows of label w stand in
@@ -462,5 +154,4 @@ def group_rows(labels: NDArray[np.int16], order: NDArray[np.intp], begin: NDArra
 
 
 _LABELS = len(MessageKind) * NODES - WRONG_LENGTH
-_NO_ROWS = np.zeros(0, np.intp)
 _NOTHING = FrameBlock.zeros(0)

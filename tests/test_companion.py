@@ -13,7 +13,7 @@ import cantools.autosar.end_to_end as e2e
 import numpy as np
 import pytest
 
-from ipmsm_can.companion import STALE_AFTER_NS, Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import DriveConfig, config_from
 from ipmsm_can.drive import profile
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
@@ -21,6 +21,7 @@ from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FrameBlock
 from ipmsm_can.motor import M2
+from ipmsm_can.node import STALE_AFTER_NS, Tracked
 from ipmsm_can.wire.dbc import Database, default_dbc_path
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 

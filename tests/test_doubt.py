@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, constant
@@ -13,6 +13,7 @@ from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
+from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 
 PROTOCOL = Protocol()

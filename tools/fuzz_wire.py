@@ -20,13 +20,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import DriveConfig, config_from
 from ipmsm_can.drive import profile
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FrameBlock
 from ipmsm_can.motor import M1, M2
+from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import BLOCK_SAMPLES, NODES, MessageKind, Protocol
 
 Ints = NDArray[np.int64]

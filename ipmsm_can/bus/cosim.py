@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.drive.node import DriveNode
 from ipmsm_can.drive.simulation import DriveSamples
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.node import Tracked
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.bus.socketcan import MessageTable, SocketCanPort, unpack
-from ipmsm_can.companion import Companion, Node, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.estimation import regression, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator, estimate_block
 from ipmsm_can.estimation.observers import ges
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.injection.meter import meter_block
+from ipmsm_can.node import Node, Tracked
 from ipmsm_can.wire.answers import due_among, position_values
 from ipmsm_can.wire.e2e import crc_p02
 from ipmsm_can.wire.kernels import FLOAT, KIND, PARENT, decode_block, encode_block

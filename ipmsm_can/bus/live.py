@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from ipmsm_can.bus.bits import BusLoad
 from ipmsm_can.bus.port import Port
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.node import Tracked
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.lane import FastLane

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can.bus.rows import RowBlock
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import confidence, speed
 from ipmsm_can.estimation.observers import ges
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_SFF_MASK, FrameBlock
+from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import NODES, MessageKind, Protocol
 from ipmsm_can.wire.sequence import LONGEST_SILENCE, RESTARTED, SampleRun
 

@@ -21,12 +21,13 @@ from ipmsm_can.bus.cosim import BusFaults, CoSimulation
 from ipmsm_can.bus.drive_runner import DriveRunner
 from ipmsm_can.bus.port import BusError, Port, open_port
 from ipmsm_can.bus.warmup import warm_up_companion, warm_up_drives
-from ipmsm_can.companion import Companion, Node
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import DriveConfig, config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import demo
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.node import Node
 from ipmsm_can.report.recorder import Record, Recorder
 from ipmsm_can.report.summary import BusFigures
 from ipmsm_can.wire.protocol import Protocol

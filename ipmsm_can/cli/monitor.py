@@ -21,8 +21,8 @@ from ipmsm_can.wire.protocol import CompanionState, InjectionReason, InjectionSt
 if TYPE_CHECKING:
     from ipmsm_can.bus.drive_runner import DriveRunner
     from ipmsm_can.bus.live import LiveRunner
-    from ipmsm_can.companion import Node, Tracked
     from ipmsm_can.drive.node import Step
+    from ipmsm_can.node import Node, Tracked
 
 _RATE_WINDOW_S = 1.0
 _QUANTILES_EVERY_S = 1.0

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import NODES, MessageKind
 
 Floats = NDArray[np.float64]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.companion import Node
 from ipmsm_can.estimation import confidence
+from ipmsm_can.node import Node
 from ipmsm_can.report.recorder import Record
 from ipmsm_can.wire.protocol import MessageKind
 

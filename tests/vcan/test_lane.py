@@ -12,13 +12,14 @@ from ipmsm_can.bus.lane import Lap
 from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.bus.warmup import warm_up_companion
-from ipmsm_can.companion import Companion, Tracked
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, constant
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
+from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 
 PROTOCOL = Protocol()
