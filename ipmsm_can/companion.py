@@ -6,7 +6,7 @@ comes back.  Bad input never raises: it is dropped, counted, and shown in Compan
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,23 +110,16 @@ class Companion:
         """
         return self.respond(self.feed(block), now_ns)
 
-    def count_usual(self, block: FrameBlock, tracked: Sequence[Tracked], timings: int) -> None:
-        """Count frames that a runner dealt with itself: the samples in `tracked`, timings, encoder references."""
-        samples = sum(t.run.counter.size for t in tracked)
-        self.counts.frames += len(block)
-        self.counts.by_kind[MessageKind.DRIVE_SAMPLE] += samples
-        self.counts.by_kind[MessageKind.DRIVE_TIMING] += timings
-        self.counts.by_kind[MessageKind.DRIVE_REFERENCE] += len(block) - samples - timings
+    def count_usual(self, by_kind: Mapping[MessageKind, int]) -> None:
+        """Count frames that a runner dealt with itself."""
+        for kind, frames in by_kind.items():
+            self.counts.frames += frames
+            self.counts.by_kind[kind] += frames
 
-    def respond(self, tracked: Sequence[Tracked], now_ns: int, answered: Sequence[Tracked] = ()) -> FrameBlock:
-        """The answers to what `feed` gave, and whatever the clock makes due.
-
-        answered: samples whose PositionEstimates a runner has sent itself.
-        """
+    def respond(self, tracked: Sequence[Tracked], now_ns: int) -> FrameBlock:
+        """The answers to what `feed` gave, and whatever the clock makes due."""
         frames: list[NDArray[np.uint8]] = []
         for number, node in self.nodes.items():
-            if answered:
-                frames += node.flux_answers([t for t in answered if t.node == number])
             if tracked:
                 frames += node.answers([t for t in tracked if t.node == number])
             frames += node.due(now_ns, self.bus_load, self.turnaround)

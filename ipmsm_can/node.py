@@ -13,11 +13,17 @@ from ipmsm_can.config.build import estimator_settings, injection_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
-from ipmsm_can.estimation.observers import ges
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.injection import meter
 from ipmsm_can.injection.scheduler import Command, InjectionScheduler
-from ipmsm_can.wire.answers import POSITION_SIGNALS, due_rows, position_values
+from ipmsm_can.wire.answers import (
+    FLUX_SIGNALS,
+    POSITION_SIGNALS,
+    due_rows,
+    flux_values,
+    position_values,
+    tracking_state,
+)
 from ipmsm_can.wire.protocol import (
     BLOCK_SAMPLES,
     PROTOCOL_VERSION,
@@ -102,7 +108,8 @@ class Node:
         self.meter = meter.new_state(config.injection.frequency, 1.0)
         self._last_arrival: int | None = None
         self.samples_per_frame = 1
-        self._next_status: int | None = None
+        self.next_status = _AT_ONCE
+        """When CompanionStatus is due [ns]."""
         self._next_command: int | None = None
         self.position_counter = 0
         self._command_counter = 0
@@ -112,6 +119,10 @@ class Node:
         position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
         self._position_width = len(position.signals)
         self.position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
+        flux = protocol.codecs[MessageKind.ACTIVE_FLUX_ESTIMATE]
+        self._flux_width = len(flux.signals)
+        self.flux_rows = np.array([flux.index[name] for name in FLUX_SIGNALS], np.intp)
+        self.status_period = round(1e9 / config.estimate.status_rate)
         self.position_step = position.layouts[position.index["theta_e"]].scale
 
     # Frames in
@@ -218,6 +229,11 @@ class Node:
         """Every how many samples a PositionEstimate is due."""
         return _every(self.view.sample_rate, self.config.estimate.rate)
 
+    @property
+    def samples_per_flux_answer(self) -> int:
+        """Every how many samples an ActiveFluxEstimate is due."""
+        return _every(self.view.sample_rate, self.config.estimate.flux_rate)
+
     def _position(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
         e = part.estimate
         values = np.zeros((self._position_width, due.size))
@@ -230,14 +246,9 @@ class Node:
 
     def _flux(self, part: Tracked, due: NDArray[np.intp]) -> NDArray[np.uint8]:
         e = part.estimate
-        phi = np.hypot(e.regression[1, due], e.regression[2, due])
-        innovation = e.flux[ges.INNOVATION, due]
-        return self._protocol.encode(MessageKind.ACTIVE_FLUX_ESTIMATE, self.number, {
-            "x_alpha": e.flux[ges.X_A, due],
-            "x_beta": e.flux[ges.X_B, due],
-            "excitation_level": 10.0 * np.log10(np.maximum(e.excitation[due], 1e-30)),
-            "innovation": np.divide(innovation, phi, out=np.zeros(due.size), where=phi > 0.0),
-        })
+        values = np.full((self._flux_width, due.size), np.nan)
+        flux_values(e.regression, e.flux, e.excitation, due, self.flux_rows, values)
+        return self._protocol.encode(MessageKind.ACTIVE_FLUX_ESTIMATE, self.number, values)
 
     def due(self, now_ns: int, bus_load: float, turnaround: float) -> list[NDArray[np.uint8]]:
         """InjectionCommand and CompanionStatus frames that are due by the clock."""
@@ -252,12 +263,18 @@ class Node:
                 "time_to_live": 1e3 * command.time_to_live,
             }, self._command_counter))
             self._command_counter += 1
-        period = round(1e9 / self.config.estimate.status_rate)
-        if self._next_status is None or not self._next_status - period < now_ns < self._next_status:
+        if not self.next_status - self.status_period < now_ns < self.next_status:
             # Due; or the clock was set back, which must not silence us until it has caught up.
-            self._next_status = now_ns + period
-            frames.append(self._status(now_ns, bus_load, turnaround))
+            self.next_status = now_ns + self.status_period
+            frames.append(self._protocol.encode(MessageKind.COMPANION_STATUS, self.number,
+                                                self.status_values(now_ns, bus_load, turnaround)))
         return frames
+
+    def quiet_ns(self, now_ns: int) -> int:
+        """How long the scheduler can do without being asked [ns]: until its next command, if it has any to give."""
+        if self.scheduler.rests:
+            return _LONG_NS
+        return 0 if self._next_command is None else self._next_command - now_ns
 
     def _command(self, now_ns: int) -> Command | None:
         period = self.config.injection.period
@@ -293,12 +310,8 @@ class Node:
             view.state = CompanionState.STALE
         elif self.foreign:
             view.state = CompanionState.FAULT
-        elif view.flags & confidence.LOCKED:
-            view.state = CompanionState.LOCKED
-        elif view.sigma < math.pi:
-            view.state = CompanionState.TRACKING
         else:
-            view.state = CompanionState.STARTING
+            view.state = CompanionState(tracking_state(view.flags, view.sigma))
         return view.state
 
     @property
@@ -306,8 +319,11 @@ class Node:
         """Frames of this node that were dropped: wrong length, wrong CRC, impossible content."""
         return self.wrong_length + self.receiver.bad_frames + self.receiver.sequencer.count("bad_rate")
 
-    def _status(self, now_ns: int, bus_load: float, turnaround: float) -> NDArray[np.uint8]:
-        return self._protocol.encode(MessageKind.COMPANION_STATUS, self.number, {
+    def status_values(self, now_ns: int, bus_load: float, turnaround: float) -> NDArray[np.float64]:
+        """Physical values of CompanionStatus as of now, float64 (n_signals, 1); turnaround [s], bus_load 0..1."""
+        index = self._protocol.codecs[MessageKind.COMPANION_STATUS].index
+        values = np.full((len(index), 1), np.nan)
+        for name, value in {
             "state": float(self.update_state(now_ns)),
             "observer": float(ObserverKind[self._settings.kind.upper()]),
             "injection_state": float(self.scheduler.state),
@@ -317,7 +333,9 @@ class Node:
             "bad_frames": self.bad_frames & 0x3FF,
             "turnaround": 1e6 * turnaround,
             "version": float(STATUS_VERSION),
-        })
+        }.items():
+            values[index[name], 0] = value
+        return values
 
 
 def _every(sample_rate: float, rate: float) -> int:
@@ -326,3 +344,5 @@ def _every(sample_rate: float, rate: float) -> int:
 
 
 _NO_ROWS = np.zeros(0, np.intp)
+_AT_ONCE = -(1 << 62)
+_LONG_NS = 1 << 62

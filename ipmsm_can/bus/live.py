@@ -97,23 +97,24 @@ class LiveRunner:
             self._plain_round(observer)
 
     def _fast_round(self, lane: FastLane, observer: Observer | None) -> None:
-        """A few answers in one go; then what Python has to see to."""
+        """A quarter of a second in one go; then what Python has to see to."""
         companion = self.companion
-        lap = lane.run(IDLE_S)
-        self.sent += lap.sent
-        if lap.sent:
-            self._time_answer(int(lap.tracked[-1].run.t_ns[-1]), TURNAROUND_EVERY)
+        lap = lane.run(IDLE_S, self._now_ns)
+        self.sent += len(lap.sent)
+        for took in lap.took.tolist():
+            self._note_turnaround(took)
         unstamped = lap.left.t_ns < 0
         if unstamped.any():
             lap.left.t_ns[unstamped] = time.time_ns()
-        companion.count_usual(lap.taken, lap.tracked, lap.timings)
+        companion.count_usual(lap.by_kind)
         now = self._time(lap.left if len(lap.left) else lap.taken)
         tracked = companion.feed(lap.left)
-        answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now, lap.tracked)])
+        answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now)])
         if len(answers):
             self.sent += self.port.send(answers)
         block = FrameBlock.concat([lap.taken, lap.left])
-        self._weigh(block, answers, now)
+        answers = FrameBlock.concat([lap.sent, answers])
+        self._weigh(block, answers, now, at_once=True)
         if observer is not None:
             observer(block, [*lap.tracked, *tracked], answers, now)
 
@@ -148,19 +149,20 @@ class LiveRunner:
             self._now_ns += round(1e9 * IDLE_S)
         return self._now_ns
 
-    def _time_answer(self, arrived_ns: int, answers: int = 1) -> None:
-        self._answered += answers
-        if self._answered % TURNAROUND_EVERY:
-            return
-        took = 1e-9 * (time.time_ns() - arrived_ns)
+    def _time_answer(self, arrived_ns: int) -> None:
+        self._answered += 1
+        if self._answered % TURNAROUND_EVERY == 0:
+            self._note_turnaround(1e-9 * (time.time_ns() - arrived_ns))
+
+    def _note_turnaround(self, took: float) -> None:
         if 0.0 <= took < _ABSURD_S:  # else the adapter stamps by a clock of its own
             self.turnaround.add(took)
             self.companion.turnaround = took
 
-    def _weigh(self, block: FrameBlock, answers: FrameBlock, now_ns: int) -> None:
+    def _weigh(self, block: FrameBlock, answers: FrameBlock, now_ns: int, at_once: bool = False) -> None:
         self._unweighed += [block, answers]
         self._rounds += 1
-        if self._rounds % LOAD_EVERY == 0:
+        if at_once or self._rounds % LOAD_EVERY == 0:
             self.load.update(FrameBlock.concat(self._unweighed))
             self._unweighed.clear()
             self.companion.bus_load = self.load.load(now_ns)

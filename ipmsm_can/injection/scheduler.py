@@ -79,6 +79,22 @@ class InjectionScheduler:
         """The operator's word: True on, False off, None back to automatic."""
         self._operator = wanted
 
+    @property
+    def rests(self) -> bool:
+        """Whether it has no command to give, and none to prepare, as long as the drive stays `calm`."""
+        if self.state is InjectionState.DISABLED:
+            return True
+        return (self.state is InjectionState.OFF and not self._wanted and self._off_left == 0
+                and self._operator is not True)
+
+    @property
+    def calm(self) -> tuple[float, float]:
+        """Speed [rad/s electrical] and excitation [V^2 s] below which a resting scheduler must be asked again."""
+        s = self.settings
+        if self.state is InjectionState.DISABLED or self._operator is not None:
+            return 0.0, 0.0
+        return s.speed_on, s.excitation_on
+
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
                fresh: bool, running: bool = True) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.

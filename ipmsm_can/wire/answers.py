@@ -1,4 +1,5 @@
-"""Which samples get an answer, and the PositionEstimate signals of those: one compiled call each."""
+"""Which samples get an answer, and what PositionEstimate and ActiveFluxEstimate say of them: compiled, so that the
+ordinary path and the compiled loop on SocketCAN say the same."""
 
 from __future__ import annotations
 
@@ -9,10 +10,16 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.confidence import LOCKED, POLARITY_KNOWN, VALID
+from ipmsm_can.wire.protocol import CompanionState
 
 POSITION_SIGNALS = ("theta_e", "omega_e", "sigma_theta", "sample_counter", "valid", "locked", "polarity_known",
                     "injecting")
 """Signals of PositionEstimate in the order that `position_values` takes their rows."""
+FLUX_SIGNALS = ("x_alpha", "x_beta", "excitation_level", "innovation")
+"""Signals of ActiveFluxEstimate in the order that `flux_values` takes their rows."""
+_FAINTEST = 1e-30
+_LOCKED, _TRACKING, _STARTING = (int(s) for s in (CompanionState.LOCKED, CompanionState.TRACKING,
+                                                  CompanionState.STARTING))
 
 _TWO_PI = 2.0 * math.pi
 
@@ -57,3 +64,28 @@ def position_values(counter: NDArray[np.int64], angle: NDArray[np.float64], sigm
         out[rows[5], m] = 1.0 if flags[k] & LOCKED else 0.0
         out[rows[6], m] = 1.0 if flags[k] & POLARITY_KNOWN else 0.0
         out[rows[7], m] = injecting[k]
+
+
+@kernel
+def flux_values(regression: NDArray[np.float64], flux: NDArray[np.float64], excitation: NDArray[np.float64],
+                due: NDArray[np.intp], rows: NDArray[np.intp], out: NDArray[np.float64]) -> None:
+    """Physical values of ActiveFluxEstimate for the rows `due`, into out (n_signals, len(due)).
+
+    regression (7, N), flux (6, N), excitation (N,) [V^2 s] as in EstimateBlock.  rows: where in `out` each of
+    FLUX_SIGNALS belongs.  The innovation is divided by |Phi|: what it means in flux [Wb].
+    """
+    for m in range(due.shape[0]):
+        k = due[m]
+        phi = math.sqrt(regression[1, k] * regression[1, k] + regression[2, k] * regression[2, k])
+        out[rows[0], m] = flux[2, k]
+        out[rows[1], m] = flux[3, k]
+        out[rows[2], m] = 10.0 * math.log10(max(excitation[k], _FAINTEST))
+        out[rows[3], m] = flux[4, k] / phi if phi > 0.0 else 0.0
+
+
+@kernel
+def tracking_state(flags: int, sigma: float) -> int:
+    """CompanionStatus.state while samples flow: locked, tracking or still starting; sigma [rad]."""
+    if flags & LOCKED:
+        return _LOCKED
+    return _TRACKING if sigma < math.pi else _STARTING

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 PLAUSIBLE = 1e6
 """Largest current [A] and voltage [V] that is taken for a measurement."""
-_AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
+AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 
 
 @kernel
@@ -86,11 +86,11 @@ class SampleReceiver:
         codecs = protocol.codecs
         self._sample = codecs[MessageKind.DRIVE_SAMPLE]
         self._timing = codecs[MessageKind.DRIVE_TIMING]
-        self._sample_rows = self._order(MessageKind.DRIVE_SAMPLE, (*_AXES, "sample_counter"))
+        self._sample_rows = self._order(MessageKind.DRIVE_SAMPLE, (*AXES, "sample_counter"))
         self._timing_rows = self._order(MessageKind.DRIVE_TIMING, ("sample_counter", "sample_rate"))
         self._block_rows = self._order(MessageKind.DRIVE_SAMPLE_BLOCK, (
             "first_sample", "sample_count",
-            *(f"{axis}_{j}" for j in range(BLOCK_SAMPLES) for axis in _AXES)))
+            *(f"{axis}_{j}" for j in range(BLOCK_SAMPLES) for axis in AXES)))
         self._no_blocks = np.zeros((2 + 4 * BLOCK_SAMPLES, 0))
 
     def _order(self, kind: MessageKind, names: tuple[str, ...]) -> Rows | None:

@@ -63,7 +63,8 @@ RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE
 COUNTERS = ("received", "filled", "lost", "duplicates", "reordered", "gaps", "resyncs", "restarts",
             "bad_rate", "overflow")
 
-_DONE, _RATE_CHANGED = range(2)
+SEQUENCED, _RATE_CHANGED = range(2)
+"""Why `sequence` stopped: at the end, or for another sample rate."""
 
 _WRAP = 1 << 32
 
@@ -239,7 +240,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
              out_t: Ints) -> tuple[int, int, int]:
     """Sequence events from `begin` on; stops after a change of sample rate.
 
-    Returns (number of samples put out, next event, _DONE or _RATE_CHANGED).  The outputs need room for
+    Returns (number of samples put out, next event, SEQUENCED or _RATE_CHANGED).  The outputs need room for
     (max_gap + 1) samples per event.
     """
     st = st_array[0]
@@ -328,7 +329,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
         st.correction = 0
         st.last_t = t_ns[k]
         k += 1
-    return m, n, _DONE
+    return m, n, SEQUENCED
 
 
 class SampleSequencer:
@@ -441,6 +442,6 @@ class SampleSequencer:
             if m:
                 runs.append(SampleRun(rate, counter[:m], np.ascontiguousarray(values[:, :m]), filled[:m],
                                       doubt[:m], gap[:m], t_ns[:m]))
-            if why == _DONE:
+            if why == SEQUENCED:
                 break
         return runs
