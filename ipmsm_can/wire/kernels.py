@@ -197,6 +197,17 @@ def _gather(words: _U64, rows: _Rows, use_rows: bool, start: int, n: int, n_word
 
 
 @kernel
+def _convert(word: _U64, up: int, down: int, signed: bool, scale: float, offset: float, out: _F64) -> None:
+    """The usual case in one pass that vectorises: up to the top of the word, down again, to a number."""
+    if signed:
+        for k in range(out.shape[0]):
+            out[k] = np.float64(np.int64(word[k] << np.uint64(up)) >> down) * scale + offset
+    else:
+        for k in range(out.shape[0]):
+            out[k] = np.float64(np.int64((word[k] << np.uint64(up)) >> np.uint64(down))) * scale + offset
+
+
+@kernel
 def decode_block(words: _U64, rows: _Rows, use_rows: bool, n_words: int, table: _I64, scaling: _F64,
                  ranges: _I64, out: _F64) -> None:
     """out[s, k] = physical value of signal s in frame k, or in frame rows[k]; NaN where it is absent."""
@@ -215,16 +226,8 @@ def decode_block(words: _U64, rows: _Rows, use_rows: bool, n_words: int, table: 
             length = table[s, LENGTH]
             shift = table[s, SHIFT]
             if kind != FLOAT and length < 64 and shift + length <= 64 and not table[s, MOTOROLA]:
-                # The usual case in one pass: up to the top of the word, down again, to a number.
-                word = buf[table[s, WORD]]
-                up = np.uint64(64 - shift - length)
-                down = np.uint64(64 - length)
-                if kind == SIGNED:
-                    for k in range(n):
-                        out[s, start + k] = np.float64(np.int64(word[k] << up) >> np.int64(down)) * scale + offset
-                else:
-                    for k in range(n):
-                        out[s, start + k] = np.float64(np.int64((word[k] << up) >> down)) * scale + offset
+                _convert(buf[table[s, WORD], :n], 64 - shift - length, 64 - length, kind == SIGNED, scale, offset,
+                         out[s, start:start + n])
             else:
                 _raw_bits(buf, n, table, s, bits)
                 if kind == FLOAT:
