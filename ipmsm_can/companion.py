@@ -58,6 +58,8 @@ class Companion:
         self.counts = FrameCounts()
         self.bus_load = 0.0
         self.turnaround = 0.0
+        self.late = 0
+        """PositionEstimates withheld because their samples were read too late."""
 
     def feed(self, block: FrameBlock) -> list[Tracked]:
         """Take in frames; returns the samples they complete, with their estimates, in order per node."""
@@ -116,12 +118,19 @@ class Companion:
             self.counts.frames += frames
             self.counts.by_kind[kind] += frames
 
-    def respond(self, tracked: Sequence[Tracked], now_ns: int) -> FrameBlock:
-        """The answers to what `feed` gave, and whatever the clock makes due."""
+    def respond(self, tracked: Sequence[Tracked], now_ns: int, late: bool = False) -> FrameBlock:
+        """The answers to what `feed` gave, and whatever the clock makes due.
+
+        late: the samples lay in a buffer for too long.  They are not answered: a PositionEstimate names its sample
+        by the low bits of the counter, which would then stand for a younger sample.
+        """
         frames: list[NDArray[np.uint8]] = []
         for number, node in self.nodes.items():
-            if tracked:
-                frames += node.answers([t for t in tracked if t.node == number])
+            own = [t for t in tracked if t.node == number]
+            if own and late:
+                self.late += node.count_due(own)
+            elif own:
+                frames += node.answers(own)
             frames += node.due(now_ns, self.bus_load, self.turnaround)
         if not frames or not self.transmit:
             return _NOTHING

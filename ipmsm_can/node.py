@@ -213,6 +213,11 @@ class Node:
                 frames.append(self._position(part, due))
         return frames + self.flux_answers(tracked)
 
+    def count_due(self, tracked: Sequence[Tracked]) -> int:
+        """How many PositionEstimates `answers` would give."""
+        return sum(due_rows(t.run.counter, _every(t.run.sample_rate, self.config.estimate.rate),
+                            int(OLDEST_ANSWER * t.run.sample_rate)).size for t in tracked)
+
     def flux_answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
         """ActiveFluxEstimate frames for the samples that are due."""
         frames = []

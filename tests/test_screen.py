@@ -24,7 +24,7 @@ NODE = NodeStatus(
     restarts=6, bad_frames=8, rejected_commands=0)
 BUS = BusStatus(
     description="can0 (SocketCAN, kernel time stamps)", load=0.573, frames=1234567, frames_per_s=5560.0, sent=99,
-    unsent=11, unknown=12, remote=13, wrong_length=14, drops=15, error_frames=2,
+    unsent=11, late=9, unknown=12, remote=13, wrong_length=14, drops=15, error_frames=2,
     errors="2 error frames: 2 x bus-off; now bus-off (silent)", turnaround_p50=120e-6, turnaround_p99=240e-6)
 STATUS = RunStatus("ipmsm-can run", 83.0, False, BUS, (NODE,))
 DRIVE = DriveStatus("ipmsm-can drive", 3.0, 16.0, "vcan0", 1000, 5560.0, 2, 1, (

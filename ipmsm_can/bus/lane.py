@@ -32,7 +32,10 @@ LAP_NS = 250_000_000
 CAPACITY = 1 << 15
 """Frames, and samples, that one lap can take in."""
 TIME_EVERY = 8
-"""Of so many answers, one is timed: reading the clock is not free everywhere."""
+"""Of so many answers, one is timed: reading the clock is not free everywhere.  Where it takes more than CHEAP_NS,
+it is also read no more often than that to see whether answers come too late; else for each of them."""
+CHEAP_NS = 1000
+_TRIALS = 100
 _READ = {
     MessageKind.DRIVE_SAMPLE: ("i_alpha", "i_beta", "v_alpha", "v_beta", "sample_counter"),
     MessageKind.DRIVE_TIMING: ("sample_counter", "sample_rate"),
@@ -47,7 +50,7 @@ class Lap:
     taken: frames that are dealt with; by_kind: how many of each kind.  tracked: their samples, empty or one.
     left: frames not dealt with.
     sent: answers sent, at the time of what they answer.  unsent: answers that the port would not take.
-    took: some of the turnarounds [s].
+    took: some of the turnarounds [s].  late: answers withheld because their samples were read too late.
     """
 
     taken: FrameBlock
@@ -57,6 +60,7 @@ class Lap:
     sent: FrameBlock
     unsent: FrameBlock
     took: NDArray[np.float64]
+    late: int
 
 
 class LanePort(Protocol):
@@ -141,6 +145,8 @@ class FastLane:
         moment = np.zeros(2, np.int64)
         self._outgoing = loop.Outgoing(out.frames, out.frames.view(np.uint64), out.iov, out.headers.ctypes.data,
                                        moment, moment.ctypes.data)
+        cheap = loop.time_clock(self._outgoing, _TRIALS) < _TRIALS * CHEAP_NS
+        self._clock_every = 1 if cheap else TIME_EVERY
         n = CAPACITY
         self._kept = loop.Kept(
             raw=np.zeros((n, 72), np.uint8), t_ns=np.zeros(n, np.int64), counter=np.zeros((2, n), np.int64),
@@ -187,13 +193,14 @@ class FastLane:
             rejected=node.rejected_commands, step=node.position_step, calm_speed=calm_speed,
             calm_excitation=calm_excitation, status_period=node.status_period,
             status=node.status_values(now_ns, companion.bus_load, companion.turnaround),
-            state_row=self._state_row, time_every=TIME_EVERY)
+            state_row=self._state_row, time_every=TIME_EVERY, clock_every=self._clock_every,
+            oldest_s=OLDEST_ANSWER)
         sequencer = node.receiver.sequencer
         rp, rs, op, os, sp, ex, cf = estimator.records
         records = loop.LaneRecords(sequencer.state, sequencer.counts, rp, rs, op, os, sp, ex, cf, node.meter)
         why = loop.lap(plan, self._wire, self._incoming, self._outgoing, records, self._kept, result)
         (taken, done, left, sent, unsent, first, counter, samples, timings, statuses, next_status,
-         timed) = result.tolist()
+         timed, late) = result.tolist()
         node.view.estimates += counter - node.position_counter
         node.position_counter = counter
         node.next_status = next_status
@@ -207,7 +214,7 @@ class FastLane:
                    else _NOTHING,
                    FrameBlock(kept.sent_words[:sent].copy().view(np.uint8), kept.sent_t_ns[:sent].copy()),
                    FrameBlock(self._outgoing.frames[first:first + unsent].copy(), np.zeros(unsent, np.int64)),
-                   kept.took[:timed].copy())
+                   kept.took[:timed].copy(), late)
 
     def _tracked(self, done: int) -> list[Tracked]:
         node, kept = self._node, self._kept

@@ -136,7 +136,8 @@ class Plan(NamedTuple):
     none is sent.  injecting, rejected: what DriveStatus said last.  step: resolution of theta_e [rad].
     calm_speed [rad/s electrical], calm_excitation [V^2 s]: below them Python is to be asked at once.
     status_period [ns]; status (n_signals, 1): CompanionStatus but for its state, in row state_row.
-    time_every: of so many answers, one is timed.
+    time_every: of so many answers, one is timed; clock_every: for so many, the clock is read once to see whether
+    they come too late, beyond oldest_s.
     """
 
     lap_ns: int
@@ -153,6 +154,8 @@ class Plan(NamedTuple):
     status: Floats
     state_row: int
     time_every: int
+    clock_every: int
+    oldest_s: float
 
 
 class Kept(NamedTuple):
@@ -174,10 +177,11 @@ class Kept(NamedTuple):
 
 
 (TAKEN, SAMPLES, LEFT, SENT, UNSENT_FRAMES, FIRST_UNSENT, COUNTER, SAMPLE_FRAMES, TIMINGS, STATUSES, NEXT_STATUS,
- TIMED, RESULTS) = range(13)
+ TIMED, LATE, RESULTS) = range(14)
 """What `lap` says in its array: frames taken in, samples estimated, frames of the last batch left alone, answers
 sent and not sent, row of the first of those, PositionEstimates sent so far; DriveSamples, DriveTimings and
-DriveStatuses taken in; when CompanionStatus is due next, turnarounds measured."""
+DriveStatuses taken in; when CompanionStatus is due next, turnarounds measured, PositionEstimates withheld for
+being late."""
 
 
 @kernel
@@ -197,6 +201,22 @@ def _says_the_same(heard: Floats, rows: Rows, plan: Plan) -> bool:
 
 
 @kernel
+def _clock(outgoing: Outgoing) -> int:
+    """Unix time [ns], the clock of the kernel's time stamps."""
+    _clock_gettime(_CLOCK_REALTIME, outgoing.moment_address)
+    return int(outgoing.moment[0] * 1_000_000_000 + outgoing.moment[1])
+
+
+@kernel
+def time_clock(outgoing: Outgoing, times: int) -> int:
+    """Read the clock so many times; returns how long that took [ns]."""
+    begin = _clock(outgoing)
+    for _ in range(times):
+        end = _clock(outgoing)
+    return end - begin
+
+
+@kernel
 def _encode(values: Floats, to: Encoder, words: Words) -> None:
     encode_block(values, 1, to.order, to.table, to.scaling, to.ranges, to.header, words)
 
@@ -213,6 +233,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
     before = records.sequencer.copy()
     counts_before = records.counts.copy()
     begin = -1
+    late = False
     while True:
         taken = result[TAKEN]
         done = result[SAMPLES]
@@ -335,6 +356,12 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
         due = np.empty(m, np.intp)
         counters = run_counter[:m]
         n_due = due_among(counters, plan.every, plan.oldest, due)
+        answer = run_counter[m - 1] // plan.every
+        if n_due > 0 and (late or answer % plan.clock_every == 0):
+            late = _clock(outgoing) - run_t[m - 1] > 1e9 * plan.oldest_s
+        if late:
+            result[LATE] += n_due
+            n_due = 0
         out = n_due
         if n_due > 0:
             said = np.empty(m, np.uint8)
@@ -348,6 +375,8 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 outgoing.frames[j, 8] = crc_p02(outgoing.frames, j, 8, wire.data_ids)
                 result[COUNTER] += 1
         n_flux = due_among(counters, plan.flux_every, plan.oldest, due)
+        if late:
+            n_flux = 0
         if n_flux > 0:
             fluxes = np.empty((wire.flux.table.shape[0], n_flux))
             fluxes[:] = np.nan
@@ -373,11 +402,8 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 result[UNSENT_FRAMES] = out - sent
                 result[FIRST_UNSENT] = sent
                 return UNSENT
-            if n_due > 0 and (run_counter[m - 1] // plan.every) % plan.time_every == 0:
-                _clock_gettime(_CLOCK_REALTIME, outgoing.moment_address)
-                left = outgoing.moment[0] * 1_000_000_000 + outgoing.moment[1]
-                if result[TIMED] < kept.took.shape[0]:
-                    kept.took[result[TIMED]] = 1e-9 * (left - run_t[m - 1])
-                    result[TIMED] += 1
+            if n_due > 0 and answer % plan.time_every == 0 and result[TIMED] < kept.took.shape[0]:
+                kept.took[result[TIMED]] = 1e-9 * (_clock(outgoing) - run_t[m - 1])
+                result[TIMED] += 1
         if full or abs(angle[speed.OMEGA, m - 1]) < plan.calm_speed or excited[m - 1] < plan.calm_excitation:
             return DONE

@@ -22,7 +22,7 @@ from ipmsm_can.bus.bits import BusLoad
 from ipmsm_can.bus.port import Port
 from ipmsm_can.companion import Companion
 from ipmsm_can.frames import FrameBlock
-from ipmsm_can.node import Tracked
+from ipmsm_can.node import OLDEST_ANSWER, Tracked
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.lane import FastLane
@@ -37,6 +37,7 @@ LOAD_EVERY = 32
 """Rounds after which the bus load is worked out."""
 _KEPT = 1 << 16
 _ABSURD_S = 10.0
+"""A frame that seems to have waited longer was stamped by another clock than ours."""
 
 Observer = Callable[[FrameBlock, Sequence[Tracked], FrameBlock, int], None]
 """Called after each round with what came in, what was estimated, what was sent, and the time [ns]."""
@@ -109,7 +110,8 @@ class LiveRunner:
         companion.count_usual(lap.by_kind)
         now = self._time(lap.left if len(lap.left) else lap.taken)
         tracked = companion.feed(lap.left)
-        answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now)])
+        companion.late += lap.late
+        answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now, self._is_late(tracked))])
         if len(answers):
             self.sent += self.port.send(answers)
         block = FrameBlock.concat([lap.taken, lap.left])
@@ -123,7 +125,7 @@ class LiveRunner:
         block = self._receive()
         now = self._time(block)
         tracked = companion.feed(block)
-        answers = companion.respond(tracked, now)
+        answers = companion.respond(tracked, now, self._is_late(tracked))
         if len(answers):
             self.sent += self.port.send(answers)
             if tracked:
@@ -148,6 +150,13 @@ class LiveRunner:
             # Counts from zero until the first frame: an adapter may stamp by any clock.
             self._now_ns += round(1e9 * IDLE_S)
         return self._now_ns
+
+    def _is_late(self, tracked: Sequence[Tracked]) -> bool:
+        """Whether the newest of these samples has waited too long to be answered, for want of a running process."""
+        if not (tracked and self.companion.transmit):
+            return False
+        waited = 1e-9 * (time.time_ns() - max(int(t.run.t_ns[-1]) for t in tracked))
+        return OLDEST_ANSWER < waited < _ABSURD_S
 
     def _time_answer(self, arrived_ns: int) -> None:
         self._answered += 1

@@ -93,7 +93,8 @@ class RunMonitor:
             self._turnaround = (p50, p99)
         bus = BusStatus(
             description=port.description, load=companion.bus_load, frames=counts.frames,
-            frames_per_s=rates["frames"], sent=self.runner.sent, unsent=port.unsent, unknown=counts.unknown,
+            frames_per_s=rates["frames"], sent=self.runner.sent, unsent=port.unsent,
+            late=companion.late, unknown=counts.unknown,
             remote=counts.remote, wrong_length=counts.wrong_length, drops=port.drops,
             error_frames=self.errors.frames, errors=self.errors.summary(),
             turnaround_p50=self._turnaround[0], turnaround_p99=self._turnaround[1])

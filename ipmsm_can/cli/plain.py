@@ -81,7 +81,7 @@ def summary(status: Status) -> str:
              f"{bus.sent} sent, load at the end {100 * bus.load:.1f} %",
              "bus: " + ", ".join(f"{name} {n}" for name, n in bus_troubles(bus)) + f"; {bus.errors}"]
     if status.transmit:
-        lines.append(f"answers: turnaround {turnaround(bus)}, unsent {bus.unsent}")
+        lines.append(f"answers: turnaround {turnaround(bus)}, unsent {bus.unsent}, too late {bus.late}")
     for n in status.nodes:
         if not n.received:
             lines.append(f"drive {n.node} ({n.motor}): no samples came")

@@ -125,7 +125,7 @@ def _bus(status: RunStatus, width: int) -> list[Text]:
     lines = [Text.assemble(("bus", "bold"), " " * (_LABEL - 1), load),
              _labelled("", _counts(plain.bus_troubles(bus)))]
     if status.transmit:
-        unsent = _counts([("unsent", bus.unsent)])
+        unsent = _counts([("unsent", bus.unsent), ("too late", bus.late)])
         lines.append(_labelled("answers", f"turnaround {plain.turnaround(bus)}  ", unsent))
     style = "red" if bus.error_frames else ""
     told = textwrap.wrap(bus.errors, max(20, width - _LABEL - 2)) or [""]

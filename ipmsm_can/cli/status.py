@@ -76,6 +76,7 @@ class BusStatus:
 
     unknown: identifiers that are none of ours.  drops: frames the kernel lost for want of buffer.
     errors: what error frames told, in words; error_frames: how many.
+    late: estimates withheld because the program read their samples too late.
     """
 
     description: str
@@ -84,6 +85,7 @@ class BusStatus:
     frames_per_s: float
     sent: int
     unsent: int
+    late: int
     unknown: int
     remote: int
     wrong_length: int

@@ -143,3 +143,37 @@ def test_same_bits_as_the_ordinary_path(kind: str) -> None:
         latest += (low - latest) % 1024
         error = np.degrees(values[index["theta_e"], k] - theta[row_of[latest]])
         assert abs((error + 180.0) % 360.0 - 180.0) < 0.012
+
+
+def test_a_backlog_is_not_answered() -> None:
+    """Samples that lay in the buffer while the process was stopped are tracked, but an answer to them would come
+    too late: the ten bits that name its sample would stand for a younger one."""
+    frames = traffic(3.0, 0.0)
+    config = config_from({"motor": {"preset": "m2"}})
+    warm_up_companion([config], PROTOCOL)
+    companion = Companion([config], PROTOCOL, transmit=True)
+    with SocketCanPort("vcan0") as port, SocketCanPort("vcan0") as sender, SocketCanPort("vcan0") as witness:
+        runner = LiveRunner(port, companion, 1e6, 5e6)
+        begin = 5000
+        for at in range(0, begin, 10):
+            sender.send(frames.take(slice(at, at + 10)))
+            while companion.counts.frames < min(at + 10, begin):
+                runner.round()
+        answered = companion.nodes[0].view.estimates
+        assert answered > 500
+        while len(witness.receive(0.0)):
+            pass
+        for at in range(begin, len(frames), 200):
+            sender.send(frames.take(slice(at, at + 200)))
+        time.sleep(0.2)
+        while companion.counts.frames < len(frames):
+            runner.round()
+        heard = []
+        while len(block := witness.receive(0.0)):
+            heard.append(block)
+    positions = FrameBlock.concat(heard).can_id == PROTOCOL.base_ids[MessageKind.POSITION_ESTIMATE]
+    withheld = companion.late
+    assert positions.sum() == companion.nodes[0].view.estimates - answered
+    assert positions.sum() <= 8  # where reading the clock is dear it is read for every eighth answer
+    assert withheld + positions.sum() > 1500
+    assert companion.nodes[0].receiver.sequencer.count("received") == (frames.can_id == 0x100).sum()
