@@ -159,7 +159,7 @@ WRONG = [
     (M2_ONLY + "[wire]\nmax_gap = '" + 500 * "x" + "'", 'wire.max_gap is "xxxxx'),
     (M2_ONLY + "[wire]\ndbc = 'no-such.dbc'",
      'wire.dbc is "no-such.dbc"; allowed is the path of a file that exists'),
-    (M2_ONLY + "[observer]\nkind = 'riccati'", 'observer.kind is "riccati"; allowed is "ges"'),
+    (M2_ONLY + "[observer]\nkind = 'luenberger'", 'observer.kind is "luenberger"; allowed is "ges", "spmsm_'),
     (M2_ONLY + "[observer]\ninitial_flux = [1]",
      "observer.initial_flux is [1]; allowed is an array of 2 values"),
     (M2_ONLY + "[observer]\ncurrent_noise = 0", "observer.current_noise is 0; allowed is a number of A rms"),

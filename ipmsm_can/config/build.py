@@ -29,7 +29,7 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
     o = config.observer
     return EstimatorSettings(o.kind, o.alpha, config.gamma, o.initial_flux, config.epsilon, o.excitation_window,
                              o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
-                             config.estimate.valid_sigma)
+                             config.estimate.valid_sigma, config.injection.frequency)
 
 
 def injection_settings(config: DriveConfig) -> InjectionSettings:

@@ -19,7 +19,8 @@ from ipmsm_can.config.section import KeyProblem, Section
 from ipmsm_can.config.simulation import CLASSICAL_RATE, FD_RATE, SimulationConfig
 from ipmsm_can.motor import PRESETS, Motor
 
-ObserverKind = Literal["ges"]
+ObserverKind = Literal["ges", "spmsm_gradient", "spmsm_gradient_max", "spmsm_regression", "active_flux_regression",
+                       "chonam", "injection_extraction", "injection_demodulation"]
 OBSERVER_KINDS: tuple[str, ...] = get_args(ObserverKind)
 """The observers a configuration may ask for; the one list of them."""
 
@@ -124,15 +125,20 @@ class ObserverConfig(Section):
     """The position observer and what it may assume about the samples."""
 
     kind: Annotated[ObserverKind, Choice(
-        doc="Observer; ges is the one of the paper's Proposition 1.", choices=OBSERVER_KINDS)] = "ges"
+        doc="Observer; ges is the one of the paper's Proposition 1. The spmsm kinds are for motors with L_d = L_q; "
+            "the injection kinds need a salient motor that injects at injection.frequency, find the angle modulo "
+            "half a turn, and never call it valid.", choices=OBSERVER_KINDS)] = "ges"
     alpha: Annotated[float, Quantity(
-        doc="Bandwidth of the regression's filters (the paper's alpha).",
+        doc="Bandwidth of the regression's filters (the paper's alpha). In the spmsm_gradient and injection kinds "
+            "the angle does not depend on it.",
         unit=units.PER_SECOND, least=1e-3, most=1e5)] = 10.0
     gamma: Annotated[float | None, Quantity(
-        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly.",
+        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly. "
+            "The spmsm_gradient kinds count it in 1/(Wb^2 s); the injection kinds have none.",
         unit=units.GRADIENT_GAIN, above=0,
         default=f"{ROTATING_CONVERGENCE:g} 1/s / (2 alpha psi_m)^2, which converges at "
-                f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed", example=0.5)] = None
+                f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed; "
+                f"{0.5 * ROTATING_CONVERGENCE:g} 1/s / psi_m^2 for the spmsm_gradient kinds", example=0.5)] = None
     initial_flux: Annotated[tuple[float, float], Quantity(
         doc="Stator flux linkage (alpha, beta) the observer starts from; with the default it starts from no "
             "assumed angle.", unit=units.WEBER, count=2)] = (0.0, 0.0)
@@ -291,9 +297,14 @@ class DriveConfig(BaseModel):
 
     @property
     def gamma(self) -> float:
-        """Observer gain [1/(V^2 s)]: the given one, or 70 1/s over (2 alpha psi_m)^2."""
+        """Observer gain: the given one, or 70 1/s over (2 alpha psi_m)^2 [1/(V^2 s)].
+
+        For the gradients on the flux's length, which converge at 2 gamma psi_m^2, 35 1/s over psi_m^2 [1/(Wb^2 s)].
+        """
         if self.observer.gamma is not None:
             return self.observer.gamma
+        if self.observer.kind.startswith("spmsm_gradient"):
+            return float(0.5 * ROTATING_CONVERGENCE / self.motor.build().psi_m ** 2)
         return float(ROTATING_CONVERGENCE / (2.0 * self.observer.alpha * self.motor.build().psi_m) ** 2)
 
     @property
