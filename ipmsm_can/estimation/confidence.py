@@ -20,8 +20,11 @@ dynamics, s^2 + k s + w^2 with k = g |Phi|^2 / T_s, is the rate.
 That is the theory of `ges`; of the other observers it describes
 
     spmsm_gradient(_max)  the linearised error, with the regressor 2 alpha psi_m x_hat/|x_hat| and no filter for
-                          the voltage error to pass; a salient machine's bias is added: (L_0/2) |i| across the
-                          axis, and as much again times k/|w|, what the slow pole makes of an error in length
+                          the voltage error to pass.  What turns with the rotor is added, times 1 + k/|w|, which
+                          the slow pole makes of an error in length: the voltage error over |w|, as dead time
+                          causes it, and a salient machine's (L_0/2) |i|.
+                          Held to the circle, spmsm_gradient turns off by phi' = w (cos phi - 1) - (w^2/k) phi: what
+                          pushes it beyond phi = w/(2k) makes it slip round, so a larger sigma means unknown
     spmsm_regression      the same linear error; (L_0/2) |i| across the axis is added
     both regressions      without d: |l| |H[i]|, which bounds it, acts as measurement noise correlated over 1/alpha
     chonam                the error along Phi; Lambda is taken as |l| |H[i]|/|x_hat| in an unknown direction, so a
@@ -54,6 +57,7 @@ _LOCK_BELOW = 4.0
 _LOST_ABOVE = 9.0
 _SIGMA_HYSTERESIS = 1.5
 _POLARITY_SIGMA = math.radians(45.0)
+_UNKNOWN_AXIS = math.pi / 2.0
 
 LOCKED = 1
 POLARITY_KNOWN = 2
@@ -65,7 +69,7 @@ STATE = np.dtype([
     ("p_aa", "f8"), ("p_ab", "f8"), ("p_bb", "f8"),
     ("test", "f8"), ("contraction", "f8"), ("locked", "i8"), ("polarity", "i8"), ("lost", "i8"),
     # What the kind of observer adds; zeros for ges.
-    ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("rate", "f8"), ("L", "f8"), ("across", "f8"),
+    ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"), ("across", "f8"),
     ("neglected", "f8"), ("spread", "f8"),
 ])
 
@@ -91,6 +95,7 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
     st["sigma_limit"] = sigma_limit
     st["L"] = common.assumed_motor(kind, motor).L_q
     st["radial"] = kind in (common.SPMSM_GRADIENT, common.SPMSM_GRADIENT_MAX)
+    st["slips"] = kind == common.SPMSM_GRADIENT
     if kind in common.NON_SALIENT:
         st["across"] = 0.5 * abs(motor.L_0)
     if kind in (common.SPMSM_REGRESSION, common.ACTIVE_FLUX_REGRESSION):
@@ -118,19 +123,31 @@ def widen(state: NDArray[np.void], flux_variance: float) -> None:
 @kernel
 def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
                 flags: NDArray[np.uint8]) -> None:
-    """Judge a block of an observer that puts out an axis and its 1-sigma, in the row of the gain."""
+    """Judge a block of an observer that puts out an axis and its 1-sigma, in the row of the gain.
+
+    One misfit may be small by chance: its mean square over INNOVATION_TIME counts if it is larger.
+    """
     st = state[0]
+    smoothing = 1.0 - math.exp(-st.T_s / INNOVATION_TIME)
     locked = st.locked
+    test = st.test if st.started else _UNKNOWN_AXIS**2
+    st.started = 1
     for k in range(flux.shape[1]):
         s = flux[5, k]
         if s < math.pi:
             late = st.delay * speed[2, k]
-            s = min(math.sqrt(s * s + late * late), math.pi)
+            s2 = s * s + late * late
+            test += smoothing * (min(s2, _UNKNOWN_AXIS**2) - test)
+            s = math.sqrt(max(s2, test))
+        else:
+            test += smoothing * (_UNKNOWN_AXIS**2 - test)
+            s = math.pi
         if not s < math.pi:
             s = math.pi
         locked = 1 if s < (_SIGMA_HYSTERESIS if locked else 1.0) * st.sigma_limit else 0
         sigma[k] = s
         flags[k] = LOCKED * locked
+    st.test = test
     st.locked = locked
 
 
@@ -227,14 +244,17 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
         if x2 > st.epsilon * st.epsilon:
             across = (x_b * x_b * p_aa - 2.0 * x_a * x_b * p_ab + x_a * x_a * p_bb) / x2
             s = math.sqrt(max(across, 0.0) / x2)
-            if st.across > 0.0:
+            if st.across > 0.0 or st.radial:
                 i2 = ((flux[0, k] - x_a) ** 2 + (flux[1, k] - x_b) ** 2) / (st.L * st.L)
-                amplified = 1.0
+                bias2 = st.across * st.across * i2
                 if st.radial:
                     if gain > 0.0:
                         st.rate = gain * phi2 / T_s
-                    amplified += st.rate / max(abs(omega), 1e-9)
-                s = math.sqrt(s * s + (st.across * amplified) ** 2 * i2 / x2)
+                    turning = max(abs(omega), 1e-9)
+                    bias2 = (bias2 + (st.voltage / (2.0 * psi_m * turning)) ** 2) * (1.0 + st.rate / turning) ** 2
+                s = math.sqrt(s * s + bias2 / x2)
+            if st.slips and 2.0 * st.rate * s > abs(omega):
+                s = math.pi
         else:
             s = math.pi
         if not s < math.pi:  # as well where an absurd sample made it NaN
