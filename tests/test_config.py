@@ -61,7 +61,7 @@ def test_defaults() -> None:
     assert config.injection.model_dump() == {
         "enabled": True, "waveform": "rotating", "amplitude": 6.0, "frequency": 400.0, "speed_on": 40.0,
         "speed_off": 60.0, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0, "current_limit": None,
-        "time_to_live": 0.1, "period": 0.02,
+        "time_to_live": 0.1, "period": 0.02, "axis": None,
     }
 
 
@@ -351,7 +351,8 @@ def test_every_key_of_the_simulated_drive_arrives() -> None:
         "current_noise": 0.03, "current_offset": (0.1, -0.2), "adc_step": 0.005, "friction": 0.001,
         "speed_imposed": True, "rotor_locked": False, "injection_limit": 20.0, "injection_ramp": 500.0,
     }
-    sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0}
+    sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0,
+            "encoder_counts": 4096}
     config = config_from({"motor": {"preset": "m2"}, "simulation": {**given, **sent}})
     assert drive_parameters(config) == DriveParameters(**given)  # type: ignore[arg-type]
     assert drive_node_settings(config) == DriveNodeSettings(**sent)  # type: ignore[arg-type]

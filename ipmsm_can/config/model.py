@@ -210,6 +210,10 @@ class InjectionConfig(Section):
     period: Annotated[float, Quantity(
         doc="Time between repeated commands; below half of time_to_live, so that one may get lost.",
         unit=units.SECOND, above=0)] = 0.02
+    axis: Annotated[float | None, Quantity(
+        doc="Fixed axis of the waveform in the stationary frame (electrical): pulsating at 0 probes v_alpha only; "
+            "rotating starts there, and its phase then does not follow the rotor.",
+        unit=units.DEGREE, least=-180, most=180, default="along the estimated d-axis", example="0 deg")] = None
 
     @model_validator(mode="after")
     def _consistent(self) -> InjectionConfig:
