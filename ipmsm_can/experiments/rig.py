@@ -92,6 +92,8 @@ def companion_config(setup: Setup, watcher: Watcher, probing: Probing | None = N
     if watcher.gamma is not None:
         observer["gamma"] = watcher.gamma
     injection: dict[str, Any] = {"enabled": False}
+    if setup.probing is not None:
+        injection["frequency"] = setup.probing.frequency
     if probing is not None:
         # What the paper injects is not negotiable: neither the current limit nor the speed shall cut it.
         injection = {"waveform": probing.waveform, "amplitude": probing.amplitude, "frequency": probing.frequency,
