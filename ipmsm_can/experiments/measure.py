@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.experiments.conditions import window_levels
 from ipmsm_can.experiments.model import Setup
 from ipmsm_can.experiments.rig import Track, protocol
 from ipmsm_can.wire.protocol import MessageKind
@@ -44,12 +45,21 @@ def lock_time(track: Track, within: float = LOCK_DEG, until: float = math.inf) -
     return float(track.reference_time[after]) if after < int(seen.sum()) else math.inf
 
 
-def current_sigma(setup: Setup) -> float:
-    """Standard deviation of a current sample [A], per axis: sensor noise, ADC steps and the wire's steps."""
+def _wire_step(setup: Setup, axis: str) -> float:
     kind = MessageKind.DRIVE_SAMPLE_BLOCK if setup.node.fd else MessageKind.DRIVE_SAMPLE
     codec = protocol().codecs[kind]
-    wire = codec.layouts[codec.index["i_alpha_0" if setup.node.fd else "i_alpha"]].scale
-    return math.sqrt(setup.drive.current_noise**2 + (setup.drive.adc_step**2 + wire**2) / 12.0)
+    return codec.layouts[codec.index[f"{axis}_0" if setup.node.fd else axis]].scale
+
+
+def current_sigma(setup: Setup) -> float:
+    """Standard deviation of a current sample [A], per axis: sensor noise, ADC steps and the wire's steps."""
+    steps = setup.drive.adc_step**2 + _wire_step(setup, "i_alpha") ** 2
+    return math.sqrt(setup.drive.current_noise**2 + steps / 12.0)
+
+
+def voltage_step(setup: Setup) -> float:
+    """Step of a voltage on the wire [V]."""
+    return _wire_step(setup, "v_alpha")
 
 
 def noise_deg(setup: Setup) -> float:
@@ -111,13 +121,7 @@ def contraction_rate(track: Track, begin: float, floor: float) -> float:
 def smallest_pe(phi: NDArray[np.complex128], time: Floats, length: float, begin: float) -> float:
     """Smallest eigenvalue [V^2 s] of the integral of Phi Phi^T over any window of `length` [s] from `begin` on."""
     step = float(time[1] - time[0])
-    n = max(1, round(length / step))
-    used = phi[time >= begin]
-    products = np.array([used.real**2, used.real * used.imag, used.imag**2]) * step
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum(products, axis=1)], axis=1)
-    aa, ab, bb = sums[:, n:] - sums[:, :-n]
-    eigen = 0.5 * (aa + bb) - np.hypot(0.5 * (aa - bb), ab)
-    return float(eigen.min())
+    return float(window_levels(phi[time >= begin], step, max(1, round(length / step))).min())
 
 
 def phi_length(alpha: float, psi_m: float, omega_e: float) -> float:

@@ -12,14 +12,14 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 
-from ipmsm_can.experiments import bench, extraction, findings, sensitivity, simulations
+from ipmsm_can.experiments import bench, extraction, findings, pe, sensitivity, simulations
 from ipmsm_can.experiments.compare import SCENES, Row, rows_of
 from ipmsm_can.experiments.draw import draw, key
 from ipmsm_can.experiments.model import Experiment, Figure, Verdict
 from ipmsm_can.experiments.rig import observe
 
 EXPERIMENTS: dict[str, Experiment] = {
-    e.name: e for part in (simulations, bench, sensitivity, extraction, findings) for e in part.EXPERIMENTS}
+    e.name: e for part in (simulations, bench, sensitivity, extraction, pe, findings) for e in part.EXPERIMENTS}
 """All experiments by name, in the order of the page."""
 COMPARISON = "comparison"
 """The name of the comparison of all observers, beside the experiments' names."""
