@@ -38,7 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="run just these experiments (see --list)")
     parser.add_argument("--out", type=Path, default=Path("out/paper.html"), metavar="FILE.html",
                         help="the page (default: out/paper.html)")
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write figures and verdicts as JSON, too")
+    parser.add_argument("--json", type=Path, default=None, metavar="FILE", help="write figures and verdicts as "
+                                                                                "JSON, too")
     parser.add_argument("--list", action="store_true", help="print names, figures and claims, and run nothing")
     parser.add_argument("--workers", type=int, default=None, metavar="N",
                         help="processes, 1 to 64 (default: one per processor); the results do not depend on it")
@@ -67,7 +68,8 @@ def main(args: argparse.Namespace) -> int:
     asked = f" --only {' '.join(names)}" if args.only else ""
     args.out.write_text(page.build(results, costs, f"ipmsm-can paper{asked}"), encoding="utf-8")
     if args.json is not None:
-        args.json.write_text(json.dumps(as_data(results, costs), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        args.json.write_text(json.dumps(as_data(results, costs), indent=1, ensure_ascii=False) + "\n",
+                             encoding="utf-8")
     print(f"\n{_tally(results)} {time.monotonic() - begin:.0f} s.\n  page: {args.out}"
           + (f"\n  data: {args.json}" if args.json is not None else ""))
     for trouble in results.troubles:
@@ -119,7 +121,8 @@ def as_data(results: Results, costs: dict[str, float]) -> dict[str, Any]:
     return {
         "experiments": [{
             "name": r.name, "figure": EXPERIMENTS[r.name].figure, "claim": EXPERIMENTS[r.name].claim,
-            "verdict": r.verdict.status.value if r.verdict else None, "why": r.verdict.why if r.verdict else r.trouble,
+            "verdict": r.verdict.status.value if r.verdict else None,
+            "why": r.verdict.why if r.verdict else r.trouble,
             "measured": [{"what": f.name, "value": number(f.value), "unit": f.unit, "margin": number(f.margin)}
                          for f in r.figures],
         } for r in results.experiments],

@@ -12,22 +12,35 @@ from ipmsm_can.drive.profile import RPM, Profile, torque_pulses
 from ipmsm_can.experiments import panels
 from ipmsm_can.experiments.draw import Plot
 from ipmsm_can.experiments.measure import VISIBLE_DEG, current_sigma, largest, lock_time, margin_deg, rms, window
-from ipmsm_can.experiments.model import Experiment, Figure, Figures, Probing, Run, Setup, Status, Tracks, Verdict, Watcher
+from ipmsm_can.experiments.model import (
+    Experiment,
+    Figure,
+    Figures,
+    Probing,
+    Run,
+    Setup,
+    Status,
+    Tracks,
+    Verdict,
+    Watcher,
+)
 
 BENCH = DriveParameters(sample_rate=5000.0, current_noise=0.02, adc_step=0.01, dead_time_voltage=0.5)
 ENCODER = DriveNodeSettings(reference_rate=1000.0, encoder_counts=10_000)
 START = (0.5, 2.0)
 """The initial flux [Wb, Wb] of the paper's first experiment; it names no other."""
-BENCH_WORDS = ("5 kHz; current noise 0.02 A rms, ADC steps of 10 mA, dead time 0.5 V a phase, an encoder of 10 000 counts "
-               "read at 1 kHz. ")
+BENCH_WORDS = ("5 kHz; current noise 0.02 A rms, ADC steps of 10 mA, dead time 0.5 V a phase, an encoder of 10 000 "
+               "counts read at 1 kHz. ")
 ROUND_OFF = 0.5
 """Gain [1/(V^2 s)] near 2 w/|Phi|^2 for alpha = 10: what suits a turning rotor."""
 _LOW, _HIGH, _LATE = (0.0, 0.3), (0.45, 0.65), (0.85, 1.2)
 
 
-def on_bench(profile: Profile, probing: Probing | None = None, seed: int = 1, **drive: float) -> Setup:
-    """M2 on the bench; drive: settings that differ from BENCH."""
-    return Setup("m2", profile, replace(BENCH, **drive), ENCODER, probing, against_encoder=True, seed=seed)  # type: ignore[arg-type]
+def on_bench(profile: Profile, probing: Probing | None = None, seed: int = 1,
+             dead_time_voltage: float = BENCH.dead_time_voltage) -> Setup:
+    """M2 on the bench; dead_time_voltage [V]."""
+    return Setup("m2", profile, replace(BENCH, dead_time_voltage=dead_time_voltage), ENCODER, probing,
+                 against_encoder=True, seed=seed)
 
 
 PULSES = on_bench(torque_pulses())
@@ -53,8 +66,8 @@ def _judge_pulses(f: Figures) -> Verdict:
     worst, ideal = f["largest from 0.5 s on, 5 kHz"], f["largest from 0.5 s on, no dead time"]
     lock = f["locked (below 5°) after, 5 kHz"].value
     why = (f"Locked after {lock:.2f} s; through the pulses {f['rms from 0.5 s on, 5 kHz'].value:.2f}° rms, "
-           f"{worst.value:.1f}° at worst (at 10 kHz {f['largest from 0.5 s on, 10 kHz, CAN FD'].value:.1f}°; without dead "
-           f"time {ideal.value:.2f}°). A plot of an angle shows {VISIBLE_DEG:g}°.")
+           f"{worst.value:.1f}° at worst (at 10 kHz {f['largest from 0.5 s on, 10 kHz, CAN FD'].value:.1f}°; "
+           f"without dead time {ideal.value:.2f}°). A plot of an angle shows {VISIBLE_DEG:g}°.")
     if lock < 0.5 and worst.value <= VISIBLE_DEG:
         return Verdict(Status.REPRODUCED, why)
     good = lock < 0.5 and ideal.value <= VISIBLE_DEG
@@ -67,8 +80,8 @@ _ACCELERATION = Profile(tuple((t, rpm * RPM) for t, rpm in (
 ACCELERATED = on_bench(_ACCELERATION)
 ACCELERATED_PROBED = on_bench(_ACCELERATION, Probing(4.0, 400.0))
 _ACC_AGAIN = on_bench(_ACCELERATION, seed=2)
-_ACC_WORDS = BENCH_WORDS + ("The times of the ramps (0.2, 0.45, 0.65, 0.9 s), a load of 1 N m, and a start at the right "
-                            "angle are ours.")
+_ACC_WORDS = BENCH_WORDS + ("The times of the ramps (0.2, 0.45, 0.65, 0.9 s), a load of 1 N m, and a start at the "
+                            "right angle are ours.")
 _PAPER, _SUITED = Watcher(alpha=10.0, gamma=50.0), Watcher(alpha=10.0, gamma=ROUND_OFF)
 
 
@@ -77,7 +90,8 @@ def _stretches(tracks: Tracks) -> list[Figure]:
     for name, t in tracks.items():
         slow = margin_deg(t.run.setup, 0.1 * OMEGA_1000)
         figures += [Figure(f"rms in 0 to 0.3 s, {name}", rms(window(t, *_LOW)), "°", slow),
-                    Figure(f"rms at 1000 rpm, {name}", rms(window(t, *_HIGH)), "°", margin_deg(t.run.setup, OMEGA_1000)),
+                    Figure(f"rms at 1000 rpm, {name}", rms(window(t, *_HIGH)), "°",
+                           margin_deg(t.run.setup, OMEGA_1000)),
                     Figure(f"rms in 0.85 to 1.2 s, {name}", rms(window(t, *_LATE)), "°", slow)]
     return figures
 
@@ -89,7 +103,8 @@ def _poor_low_good_high(f: Figures, name: str) -> bool:
 
 
 def _three(f: Figures, name: str) -> str:
-    low, high, late = (f[f"rms {where}, {name}"].value for where in ("in 0 to 0.3 s", "at 1000 rpm", "in 0.85 to 1.2 s"))
+    low, high, late = (f[f"rms {where}, {name}"].value for where in ("in 0 to 0.3 s", "at 1000 rpm",
+                                                                     "in 0.85 to 1.2 s"))
     return f"{low:.2f}, {high:.2f} and {late:.2f}° rms"
 
 
@@ -99,8 +114,8 @@ def _judge_fig10(f: Figures) -> Verdict:
     if _poor_low_good_high(f, "γ 50"):
         return Verdict(Status.REPRODUCED, why)
     if _poor_low_good_high(f, "γ 0.5"):
-        return Verdict(Status.CONDITION, why + " Poor at low and excellent at high speed it is with the smaller gain; at "
-                       "γ = 50 the error contracts too slowly to follow the change of speed.")
+        return Verdict(Status.CONDITION, why + " Poor at low and excellent at high speed it is with the smaller "
+                       "gain; at γ = 50 the error contracts too slowly to follow the change of speed.")
     return Verdict(Status.NOT, why)
 
 
@@ -119,15 +134,16 @@ def _injection_figures(tracks: Tracks) -> list[Figure]:
 def _judge_fig11(f: Figures) -> Verdict:
     gains = [f[f"gain by injection {what}"] for what in ("in 0 to 0.3 s", "in 0.85 to 1.2 s")]
     suited = [f[f"gain by injection {what}, γ 0.5"].value for what in ("in 0 to 0.3 s", "in 0.85 to 1.2 s")]
-    why = (f"Injection takes {100 * gains[0].value:.0f} and {100 * gains[1].value:.0f} % off the rms error of the two slow "
-           f"stretches (another seed of the noise: {100 * (gains[0].margin or 0):.0f} and "
+    why = (f"Injection takes {100 * gains[0].value:.0f} and {100 * gains[1].value:.0f} % off the rms error of the "
+           f"two slow stretches (another seed of the noise: {100 * (gains[0].margin or 0):.0f} and "
            f"{100 * (gains[1].margin or 0):.0f} %); at γ = 0.5, {100 * suited[0]:.0f} and {100 * suited[1]:.0f} %.")
     if min(g.value for g in gains) > 0.5:
         return Verdict(Status.REPRODUCED, why)
     if min(suited) > 0.5:
         return Verdict(Status.CONDITION, why)
-    return Verdict(Status.NOT, why + " A remarkable improvement would halve it. What there is comes from the ripple, which "
-                   "smooths the dead time; as excitation the signal needs minutes at these gains (see injection-time).")
+    return Verdict(Status.NOT, why + " A remarkable improvement would halve it. What there is comes from the "
+                   "ripple, which smooths the dead time; as excitation the signal needs minutes at these gains "
+                   "(see injection-time).")
 
 
 def _ripple_figures(tracks: Tracks) -> list[Figure]:
@@ -149,17 +165,15 @@ def _judge_ripple(f: Figures) -> Verdict:
     found, computed = f["current at 400 Hz, positive sequence"], f["4 V over the machine's impedance"].value
     good = found.value > (found.margin or 0.0) and 0.5 < found.value / computed < 2.0
     return Verdict(Status.REPRODUCED if good else Status.NOT,
-                   f"On the load's current rides one at 400 Hz of {found.value:.3f} A (without the current control 4 V would "
-                   f"drive {computed:.3f} A); the largest current is {f['largest current'].value:.1f} A.")
+                   f"On the load's current rides one at 400 Hz of {found.value:.3f} A (without the current control "
+                   f"4 V would drive {computed:.3f} A); the largest current is {f['largest current'].value:.1f} A.")
 
 
-def _slow(probing: Probing | None = None, **drive: float) -> Setup:
-    return on_bench(Profile(((0.0, 20.0 * RPM),), ((0.0, 2.0),), 4.0, "20 rpm"), probing, **drive)
-
-
+_SLOW = Profile(((0.0, 20.0 * RPM),), ((0.0, 2.0),), 4.0, "20 rpm")
 _SIX = Probing(6.0, 400.0)
-SLOW_PROBED = _slow(_SIX)
-_SLOW_PAPER, _SLOW_SUITED = Watcher(alpha=10.0, gamma=50.0, start=START), Watcher(alpha=10.0, gamma=0.1, start=START)
+SLOW_PROBED = on_bench(_SLOW, _SIX)
+_SLOW_PAPER, _SLOW_SUITED = Watcher(alpha=10.0, gamma=50.0, start=START), Watcher(alpha=10.0, gamma=0.1,
+                                                                                  start=START)
 _REVERSAL = Profile(((0.0, 20.0 * RPM), (1.5, 20.0 * RPM), (2.5, -20.0 * RPM), (4.0, -20.0 * RPM)),
                     ((0.0, 0.0), (0.5, 0.0), (0.5, 3.0), (1.0, 3.0), (1.0, 0.0), (3.0, 0.0), (3.0, 3.0), (3.5, 3.0),
                      (3.5, 0.0)), 4.0, "reversal")
@@ -180,8 +194,8 @@ def _judge_slow(f: Figures) -> Verdict:
     rows = {x.name.split(", ", 1)[1]: x for x in f.values() if x.name.startswith("largest")}
     deviation = {x.name.split(", ", 1)[1]: x.value for x in f.values() if x.name.startswith("rms")}
     published = rows.pop("published gains")
-    why = (f"At the published gains {deviation.pop('published gains'):.1f}° rms, {published.value:.1f}° at worst; the dead "
-           f"time alone may give {published.margin:.0f}° at 20 rpm. ")
+    why = (f"At the published gains {deviation.pop('published gains'):.1f}° rms, {published.value:.1f}° at worst; "
+           f"the dead time alone may give {published.margin:.0f}° at 20 rpm. ")
     others = "; ".join(f"{name}: {deviation[name]:.1f}° rms, {x.value:.1f}° at worst" for name, x in rows.items())
     if published.value <= VISIBLE_DEG:
         return Verdict(Status.REPRODUCED, why + others + ".")
@@ -203,14 +217,16 @@ EXPERIMENTS = (
         "fig9", "Fig. 9", "1000 rpm under torque pulses",
         "High estimation performance at a constant high speed under a load pulsed from zero to the rated torque.",
         BENCH_WORDS + "α = 5, γ = 50; pulses of 0.5 s.",
-        (Run("5 kHz", PULSES, _FIRST), Run("10 kHz, CAN FD", PULSES_FD, _FIRST), Run("no dead time", PULSES_IDEAL, _FIRST)),
+        (Run("5 kHz", PULSES, _FIRST), Run("10 kHz, CAN FD", PULSES_FD, _FIRST),
+         Run("no dead time", PULSES_IDEAL, _FIRST)),
         _pulse_figures, _judge_pulses,
         lambda tracks: [panels.angle(tracks["5 kHz"], 0.0, 0.15), *_flux_plots(tracks, "5 kHz", 0.47, 0.56),
                         panels.shaft_speed(tracks["5 kHz"]),
                         panels.error(tracks, 0.0, limit=margin_deg(PULSES, OMEGA_1000), most=4.0)]),
     Experiment(
         "fig10", "Fig. 10", "100–1000–100 rpm without injection",
-        "Excellent at high speed, relatively poor in [0, 0.3] s and [0.85, 1.2] s, where the motor is slow.", _ACC_WORDS,
+        "Excellent at high speed, relatively poor in [0, 0.3] s and [0.85, 1.2] s, where the motor is slow.",
+        _ACC_WORDS,
         (Run("γ 50", ACCELERATED, _PAPER), Run("γ 0.5", ACCELERATED, _SUITED)), _stretches, _judge_fig10,
         lambda tracks: [panels.shaft_speed(tracks["γ 50"]), panels.angle(tracks, 0.0, 0.3),
                         panels.active_flux(tracks["γ 50"], 0.0, 0.3), panels.error(tracks, most=10.0)]),
@@ -231,20 +247,22 @@ EXPERIMENTS = (
         lambda tracks: [Plot("Both currents", "t [s]", "current [A peak]",
                              panels.components(tracks["γ 50, injection"].time, tracks["γ 50, injection"].i)),
                         Plot("Close up", "t [s]", "current [A peak]",
-                             panels.components(tracks["γ 50, injection"].time, tracks["γ 50, injection"].i), (0.1, 0.13))]),
+                             panels.components(tracks["γ 50, injection"].time, tracks["γ 50, injection"].i),
+                             (0.1, 0.13))]),
     Experiment(
         "fig13", "Fig. 13", "20 rpm with 6 V at 400 Hz",
         "Angle and flux are estimated at a constant low speed under constant load.",
         BENCH_WORDS + "α = 10, γ = 50 and the start (0.5, 2) Wb are those of the other experiments; load 2 N m.",
         (Run("published gains", SLOW_PROBED, _SLOW_PAPER), Run("γ = 0.1", SLOW_PROBED, _SLOW_SUITED),
-         Run("published gains, no dead time", _slow(_SIX, dead_time_voltage=0.0), _SLOW_PAPER)),
+         Run("published gains, no dead time", on_bench(_SLOW, _SIX, dead_time_voltage=0.0), _SLOW_PAPER)),
         lambda tracks: _slow_figures(tracks, 3.0), _judge_slow,
         lambda tracks: [panels.angle(panels.pick(tracks, ("published gains", "γ = 0.1")), 0.0, 4.0),
                         panels.active_flux(tracks["published gains"], 0.0, 4.0), panels.error(tracks, most=30.0)]),
     Experiment(
         "fig14", "Fig. 14", "Reversal from 20 to −20 rpm with injection",
         "Satisfactory at low speed and standstill, under a pulsed load.",
-        BENCH_WORDS + "6 V at 400 Hz; α = 10, γ = 50 and the start as before; reversal from 1.5 to 2.5 s, pulses of 3 N m.",
+        BENCH_WORDS + "6 V at 400 Hz; α = 10, γ = 50 and the start as before; reversal from 1.5 to 2.5 s, pulses "
+                      "of 3 N m.",
         (Run("published gains", REVERSED_PROBED, _SLOW_PAPER),
          Run("α = 200, γ = 0.5", REVERSED_PROBED, Watcher(alpha=200.0, gamma=0.5, start=START)),
          Run("published gains, no dead time", on_bench(_REVERSAL, _SIX, dead_time_voltage=0.0), _SLOW_PAPER)),

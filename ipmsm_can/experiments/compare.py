@@ -52,8 +52,12 @@ class Scene:
 
 @dataclass(frozen=True)
 class Row:
-    """One observer on one scene.  published: with the experiment's gains, else the configuration's.  lock [s], inf = never; rms, largest [deg electrical] over the second half;
-    opposite: |error| [deg] at the end after a start 180 degrees off, opposite_lock [s] its lock time."""
+    """One observer on one scene.
+
+    published: with the experiment's gains, else the configuration's.  lock [s], inf = never.  rms, largest [deg
+    electrical] over the second half of the run.  opposite: |error| [deg] at the end after a start 180 degrees off,
+    opposite_lock [s]: its lock time.
+    """
 
     scene: str
     kind: str
@@ -75,10 +79,13 @@ SCENES = (
     Scene("acceleration", "M2, 100–1000–100 rpm", "Fig. 10", bench.ACCELERATED, _PAPER),
     Scene("acceleration-probed", "M2, 100–1000–100 rpm, 4 V injected", "Fig. 11", bench.ACCELERATED_PROBED, _PAPER),
     Scene("20rpm", "M2, 20 rpm, 6 V injected", "Fig. 13", bench.SLOW_PROBED, _PAPER, _SLOW_DEG),
-    Scene("reversal-probed", "M2, reversal at ±20 rpm, 6 V injected", "Fig. 14", bench.REVERSED_PROBED, _PAPER, _SLOW_DEG),
+    Scene("reversal-probed", "M2, reversal at ±20 rpm, 6 V injected", "Fig. 14", bench.REVERSED_PROBED, _PAPER,
+          _SLOW_DEG),
     Scene("reversal", "M2, the same without injection", "Fig. 14, quiet", bench.REVERSED, _PAPER, _SLOW_DEG),
-    Scene("v-alpha-20rpm", "M2, 20 rpm, 6 V in v_α", "Fig. 20, slow", extraction.LOW, replace(_PAPER, alpha=50.0), _SLOW_DEG),
-    Scene("v-alpha-1000rpm", "M2, 1000 rpm, 6 V in v_α", "Fig. 20, fast", extraction.HIGH, replace(_PAPER, alpha=50.0)),
+    Scene("v-alpha-20rpm", "M2, 20 rpm, 6 V in v_α", "Fig. 20, slow", extraction.LOW, replace(_PAPER, alpha=50.0),
+          _SLOW_DEG),
+    Scene("v-alpha-1000rpm", "M2, 1000 rpm, 6 V in v_α", "Fig. 20, fast", extraction.HIGH,
+          replace(_PAPER, alpha=50.0)),
     Scene("standstill", "M2, standstill, 6 V injected", "standstill", findings.STANDSTILL, _PAPER, _SLOW_DEG),
 )
 
@@ -90,7 +97,7 @@ def variants() -> list[tuple[str, bool]]:
 
 
 def gains_of(scene: Scene, kind: str, published: bool) -> Watcher:
-    """The scene's start, with its gains or with those of the configuration (alpha 10, gamma fitted to the motor)."""
+    """The scene's start, with its gains or the configuration's (alpha 10, gamma fitted to the motor)."""
     if published:
         return replace(scene.watcher, kind=kind)
     return replace(scene.watcher, kind=kind, alpha=10.0, gamma=None)

@@ -24,8 +24,11 @@ _INNER = WIDTH - LEFT - RIGHT
 _FEW = 4
 _LETTER = 6.6
 """Width of a character [px], on the safe side."""
-_MOST_POINTS = 1600
+_MOST_POINTS = 2600
 """Points of a curve in a plane, where no envelope can be taken."""
+_FEW_DOTS = 50
+_ANGLE_POINTS = 1200
+"""Points of an angle that wraps."""
 
 
 @dataclass(frozen=True)
@@ -59,23 +62,35 @@ class Plot:
 
 def angle_curves(time: Floats, truth: Floats, estimates: list[tuple[Floats, str]]) -> tuple[Curve, ...]:
     """The rotor's angle and estimates of it [rad] as curves in degrees, broken where they wrap."""
-    curves = [Curve(time, _broken(truth), "truth", "rotor")]
-    curves += [Curve(time, _broken(theta), f"c{k}", label) for k, (theta, label) in enumerate(estimates)]
+    curves = [Curve(*unjoined(time, _degrees(truth)), "truth", "rotor")]
+    curves += [Curve(*unjoined(time, _degrees(theta)), f"c{k}", label) for k,
+               (theta, label) in enumerate(estimates)]
     return tuple(curves)
 
 
-def _broken(theta: Floats) -> Floats:
-    y = np.degrees(np.remainder(theta + np.pi, 2.0 * np.pi) - np.pi)
-    out = y.copy()
-    out[1:][np.abs(np.diff(y)) > 180.0] = np.nan
-    return out
+def _degrees(theta: Floats) -> Floats:
+    return np.asarray(np.degrees(np.remainder(theta + np.pi, 2.0 * np.pi) - np.pi))
+
+
+def unjoined(x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """x and an angle y [deg] with a break where it wraps.
+
+    Thinned where there are breaks, for the envelope that `draw` takes of many points would join them again.
+    """
+    if not (np.abs(np.diff(y)) > 180.0).any():
+        return x, y
+    every = slice(None, None, max(1, -(-x.size // _ANGLE_POINTS)))
+    x, y = x[every], y[every].copy()
+    y[1:][np.abs(np.diff(y)) > 180.0] = np.nan
+    return x, y
 
 
 def draw(plot: Plot, name: str) -> str:
     """The plot as one `svg` element; name: unique on the page."""
     frame = _Frame.of(plot)
     clip = f'clip-path="url(#{name})"'
-    parts = [f'<clipPath id="{name}"><rect x="{LEFT}" y="{TOP}" width="{_INNER}" height="{frame.height}"/></clipPath>']
+    parts = [f'<clipPath id="{name}"><rect x="{LEFT}" y="{TOP}" width="{_INNER}" '
+             f'height="{frame.height}"/></clipPath>']
     for value, label in frame.y_ticks:
         y = float(frame.py(np.array([value]))[0])
         parts.append(f'<path class="{"zero" if value == 0 else "grid"}" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
@@ -106,7 +121,9 @@ def key(plot: Plot) -> str:
 
 
 def _classes(curve: Curve) -> str:
-    return f"{curve.role} dots" if curve.dots else curve.role
+    if not curve.dots:
+        return curve.role
+    return f"{curve.role} dots" if curve.x.size <= _FEW_DOTS else f"{curve.role} dots fine"
 
 
 def _text(x: float, y: float, words: str, anchor: str, role: str = "tick") -> str:

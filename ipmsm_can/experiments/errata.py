@@ -10,8 +10,10 @@ ERRATA = (
      "M has norm at most 1, so I − M at most 2."),
     ("bounds with ℓ", "ℓ/|x̂|", "|ℓ|/|x̂|", "ℓ = ψ_m L0 is negative for most machines."),
     ("Section 4, first sentence", "“PE Assumption 2”", "Assumption 3", "Assumption 2 is boundedness."),
-    ("gradient of the observer (newobs)", "(Φ + Λ)(y − …)", "−2 (Φ + Λ)(y − …)", "Derivative of a square, and of −Φᵀx̂."),
-    ("effect of α", "“increase in the signal-to-noise ratio”", "decrease", "A larger bandwidth lets more noise through."),
+    ("gradient of the observer (newobs)", "(Φ + Λ)(y − …)", "−2 (Φ + Λ)(y − …)", "Derivative of a square, and of "
+                                                                                 "−Φᵀx̂."),
+    ("effect of α", "“increase in the signal-to-noise ratio”", "decrease", "A larger bandwidth lets more noise "
+                                                                           "through."),
     ("caption of the 20 rpm figure", "“high constant speed (20 RPM)”", "low", ""),
 )
 """(where, as printed, should be, why)."""

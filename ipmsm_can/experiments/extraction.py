@@ -1,4 +1,4 @@
-"""Section 5.2, last part: the proposed observer against extraction of position from an injection in v_alpha only."""
+"""Section 5.2, last part: the proposed observer against extraction of position from injection in v_alpha only."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def _judge(f: Figures) -> Verdict:
         return Verdict(Status.NOT, "This build has no observer that extracts position from the injected signal.")
     low, low_2 = f["rms, proposed, 20 rpm"], f["rms, extraction, 20 rpm"]
     high, high_2 = f["rms, proposed, 1000 rpm"], f["rms, extraction, 1000 rpm"]
-    why = (f"At 20 rpm {low.value:.1f}° rms (proposed) and {low_2.value:.1f}° rms (extraction); at 1000 rpm {high.value:.1f}° "
-           f"and {high_2.value:.0f}° rms.")
+    why = (f"At 20 rpm {low.value:.1f}° rms (proposed) and {low_2.value:.1f}° rms (extraction); at 1000 rpm "
+           f"{high.value:.1f}° and {high_2.value:.0f}° rms.")
     similar = abs(low.value - low_2.value) <= VISIBLE_DEG
     fails = f["largest, extraction, 1000 rpm"].value > _LOST_DEG and high.value <= VISIBLE_DEG
     if similar and fails:
         return Verdict(Status.REPRODUCED, why)
     if fails:
         better = "proposed observer" if low.value < low_2.value else "extraction"
-        return Verdict(Status.CONDITION, f"{why} Extraction fails at high speed as said; at low speed the {better} is "
-                       "clearly better with this dead time.")
+        return Verdict(Status.CONDITION, f"{why} Extraction fails at high speed as said; at low speed the {better} "
+                       "is clearly better with this dead time.")
     return Verdict(Status.NOT, why)
 
 
@@ -57,11 +57,14 @@ EXPERIMENTS = (
     Experiment(
         "fig20", "Fig. 20", "Against extraction from the injected signal",
         "Performances are similar at low speed; at high speed the proposed observer works and extraction fails.",
-        BENCH_WORDS + "6 V at 400 Hz in v_α only, α = 50, γ = 50, load 1 N m, starts 20° off. The paper used the motor of "
-        "its reference, which it does not give; here it is M2. Extraction is reconstructed, see its docstring.",
+        BENCH_WORDS + "6 V at 400 Hz in v_α only, α = 50, γ = 50, load 1 N m, starts 20° off. The paper used the "
+        "motor of its reference, which it does not give; here it is M2. Extraction is reconstructed, see its "
+        "docstring.",
         _runs(), _figures, _judge,
         lambda tracks: [panels.angle({n: t for n, t in tracks.items() if "20 rpm" in n}, 0.0, 2.0, "20 rpm"),
-                        panels.error({n: t for n, t in tracks.items() if "20 rpm" in n}, title="Error at 20 rpm", most=30.0),
-                        panels.error({n: t for n, t in tracks.items() if "1000 rpm" in n}, title="Error at 1000 rpm",
+                        panels.error({n: t for n, t in tracks.items() if "20 rpm" in n}, title="Error at 20 rpm",
+                                     most=30.0),
+                        panels.error({n: t for n, t in tracks.items() if "1000 rpm" in n},
+                                     title="Error at 1000 rpm",
                                      most=190.0)]),
 )

@@ -92,7 +92,7 @@ def margin_deg(setup: Setup, omega_e: float) -> float:
 
 def flux_error(track: Track) -> Floats:
     """|x_hat - x| [Wb] at every sample."""
-    return np.abs(track.x - track.truth.active_flux * np.exp(1j * track.truth.theta_e))
+    return np.asarray(np.abs(track.x - track.truth.active_flux * np.exp(1j * track.truth.theta_e)))
 
 
 def flux_time(track: Track, share: float = 0.05) -> float:
@@ -125,7 +125,7 @@ def smallest_pe(phi: NDArray[np.complex128], time: Floats, length: float, begin:
 
 
 def phi_length(alpha: float, psi_m: float, omega_e: float) -> float:
-    """|Phi| [V] of a rotor that turns at omega_e [rad/s electrical] with i_d = 0: 2 alpha psi w/sqrt(w^2 + alpha^2)."""
+    """|Phi| [V] of a rotor turning at omega_e [rad/s electrical], i_d = 0: 2 alpha psi w/sqrt(w^2 + alpha^2)."""
     return 2.0 * alpha * psi_m * abs(omega_e) / math.hypot(omega_e, alpha)
 
 

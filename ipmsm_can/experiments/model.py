@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING
 
@@ -44,7 +44,7 @@ class Setup:
     motor: str
     profile: Profile
     drive: DriveParameters
-    node: DriveNodeSettings = DriveNodeSettings()
+    node: DriveNodeSettings = field(default_factory=DriveNodeSettings)
     probing: Probing | None = None
     theta_0: float = 0.0
     against_encoder: bool = False

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can.drive.profile import RPM
-from ipmsm_can.experiments.draw import Curve, Plot, angle_curves
+from ipmsm_can.experiments.draw import Curve, Plot, angle_curves, unjoined
 from ipmsm_can.experiments.rig import Track
 
 _TIME = "t [s]"
@@ -28,7 +28,8 @@ def pick(tracks: Mapping[str, Track], names: Iterable[str]) -> dict[str, Track]:
     return {name: tracks[name] for name in names}
 
 
-def angle(tracks: Mapping[str, Track] | Track, begin: float, end: float, title: str = "Rotor angle and estimate") -> Plot:
+def angle(tracks: Mapping[str, Track] | Track, begin: float, end: float,
+          title: str = "Rotor angle and estimate") -> Plot:
     """theta and theta_hat [deg electrical] over a stretch of time [s]; all runs must share one drive."""
     named = _named(tracks)
     first = next(iter(named.values()))
@@ -39,12 +40,13 @@ def angle(tracks: Mapping[str, Track] | Track, begin: float, end: float, title: 
 
 def error(tracks: Mapping[str, Track] | Track, begin: float = 0.0, end: float = math.inf,
           limit: float | None = None, title: str = "Error of the angle", most: float | None = None) -> Plot:
-    """theta_hat - theta [deg electrical]; limit: the margin, drawn on either side; most: half height of the axis."""
+    """theta_hat - theta [deg electrical]; limit: margin, drawn on either side; most: half height of the axis."""
     named = _named(tracks)
     curves = []
     for k, (name, t) in enumerate(named.items()):
         inside = (t.reference_time >= begin) & (t.reference_time <= end)
-        curves.append(Curve(t.reference_time[inside], t.error[inside], f"c{k}", name if len(named) > 1 else ""))
+        x, y = unjoined(t.reference_time[inside], t.error[inside])
+        curves.append(Curve(x, y, f"c{k}", name if len(named) > 1 else ""))
     last = min(end, max(float(t.time[-1]) for t in named.values()))
     if limit is not None:
         ends = np.array([begin, last])
@@ -80,10 +82,11 @@ def shaft_speed(track: Track, unit: str = "rpm") -> Plot:
 
 
 def plane(values: Mapping[str, NDArray[np.complex128]], title: str, x_label: str, y_label: str,
-          truth: str = "") -> Plot:
-    """Curves in the alpha-beta plane with equal axes; `truth`: the name that is drawn as such."""
+          truth: str = "", dots: bool = False) -> Plot:
+    """Curves in the alpha-beta plane with equal axes; `truth`: the name that is drawn as such; dots: samples."""
     roles = iter(("c0", "c1", "c2", "c3"))
-    curves = tuple(Curve(v.real, v.imag, "truth" if name == truth else next(roles), name if len(values) > 1 else "")
+    curves = tuple(Curve(v.real, v.imag, "truth" if name == truth else next(roles), name if len(values) > 1 else "",
+                         dots)
                    for name, v in values.items())
     return Plot(title, x_label, y_label, curves, equal=True)
 

@@ -6,16 +6,26 @@ from dataclasses import replace
 
 import numpy as np
 
+from ipmsm_can.drive.parameters import DriveParameters
+from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.experiments import panels
-from ipmsm_can.experiments.bench import BENCH_WORDS
 from ipmsm_can.experiments.conditions import Verdict as Check
 from ipmsm_can.experiments.conditions import check_c1, check_c2, check_c3, check_phi
 from ipmsm_can.experiments.draw import Plot
 from ipmsm_can.experiments.measure import current_sigma, voltage_step
-from ipmsm_can.experiments.model import Experiment, Figure, Figures, Probing, Run, Setup, Status, Tracks, Verdict, Watcher
+from ipmsm_can.experiments.model import (
+    Experiment,
+    Figure,
+    Figures,
+    Probing,
+    Run,
+    Setup,
+    Status,
+    Tracks,
+    Verdict,
+    Watcher,
+)
 from ipmsm_can.experiments.rig import Track
-from ipmsm_can.drive.parameters import DriveParameters
-from ipmsm_can.drive.profile import RPM, Profile
 
 _WINDOW, _REQUIRED = 0.1, 0.01
 _BEGIN = 1.0
@@ -28,7 +38,8 @@ _TWENTY = Probing(20.0, 400.0)
 
 def _setup(rpm: float, probing: Probing | None) -> Setup:
     drive = _CLEAN if rpm else _LOCKED
-    return Setup("m2", Profile(((0.0, rpm * RPM),), ((0.0, 2.0 if rpm else 0.0),), 1.6), drive, probing=probing, theta_0=0.7)
+    return Setup("m2", Profile(((0.0, rpm * RPM),), ((0.0, 2.0 if rpm else 0.0),), 1.6), drive, probing=probing,
+                 theta_0=0.7)
 
 
 _CASES = {
@@ -38,7 +49,8 @@ _CASES = {
     "standstill, pulsating": (_setup(0.0, replace(_TWENTY, waveform="pulsating")), set[str]()),
 }
 """The run's drive, and the conditions that the theory says hold there."""
-_SYMBOLS = {"C1": "C1: v − Ri − L_s p[i]", "C2": "C2: p[−(L0/2) i + (L0 iᵀc + ψ_m) c]", "C3": "C3: p[i], as (L0/2) p[i]",
+_SYMBOLS = {"C1": "C1: v − Ri − L_s p[i]", "C2": "C2: p[−(L0/2) i + (L0 iᵀc + ψ_m) c]",
+            "C3": "C3: p[i], as (L0/2) p[i]",
             "A3": "Assumption 3: Φ"}
 
 
@@ -72,13 +84,14 @@ def _judge(f: Figures) -> Verdict:
                 wrong.append(f"{condition} at {name}")
     if wrong:
         return Verdict(Status.NOT, f"Other than the theory says: {', '.join(wrong)}.")
-    return Verdict(Status.REPRODUCED, "Turning, C1 and C2 hold, and Φ is PE; standing still all fail; with rotating "
-                   "injection all hold; with injection along one axis all fail, for p[i] is then a line. Wherever a "
-                   "condition holds, Φ is PE. C3 silently needs L0 ≠ 0.")
+    return Verdict(Status.REPRODUCED, "Turning, C1 and C2 hold, and Φ is PE; standing still all fail; with "
+                   "rotating injection all hold; with injection along one axis all fail, for p[i] is then a line. "
+                   "Wherever a condition holds, Φ is PE. C3 silently needs L0 ≠ 0.")
 
 
 def _plots(tracks: Tracks) -> list[Plot]:
-    return [panels.plane({name: tracks[name].phi[tracks[name].time >= _BEGIN]}, f"Φ, {name}", "Φ_α [V]", "Φ_β [V]")
+    return [panels.plane({name: tracks[name].phi[tracks[name].time >= _BEGIN]}, f"Φ, {name}", "Φ_α [V]", "Φ_β [V]",
+                         dots=True)
             for name in ("1000 rpm", "standstill, rotating", "standstill, pulsating")]
 
 
@@ -86,9 +99,9 @@ EXPERIMENTS = (
     Experiment(
         "conditions", "Prop. 2", "The conditions C1, C2, C3",
         "Φ is PE if one of C1, C2, or, at standstill, C3 holds.",
-        "M2 without noise at 5 kHz; smallest eigenvalue over any window of 0.1 s from 1 s on; a condition holds where it "
-        "exceeds 0.01 V² s and what quantisation alone can make of it (the threshold); for Φ scaled by its filter. Injection "
-        "of 20 V at 400 Hz.",
+        "M2 without noise at 5 kHz; smallest eigenvalue over any window of 0.1 s from 1 s on; a condition holds "
+        "where it exceeds 0.01 V² s and what quantisation alone can make of it (the threshold); for Φ scaled by "
+        "its filter. Injection of 20 V at 400 Hz.",
         tuple(Run(name, setup, Watcher(alpha=_ALPHA)) for name, (setup, _) in _CASES.items()),
         _figures, _judge, _plots),
 )

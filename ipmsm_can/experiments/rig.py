@@ -29,7 +29,7 @@ from ipmsm_can.wire.protocol import MessageKind, Protocol
 Floats = NDArray[np.float64]
 
 _LOOK_S = 5e-3
-"""How often drive and companion look at the bus in a run with injection; commands come every 20 ms."""
+"""How often drive and companion look at the bus in a run with injection, and how often commands come."""
 _MOTOR_KEYS = ("pole_pairs", "psi_m", "L_d", "L_q", "R", "J", "rated_torque")
 
 
@@ -97,7 +97,7 @@ def companion_config(setup: Setup, watcher: Watcher, probing: Probing | None = N
     if probing is not None:
         # What the paper injects is not negotiable: neither the current limit nor the speed shall cut it.
         injection = {"waveform": probing.waveform, "amplitude": probing.amplitude, "frequency": probing.frequency,
-                     "axis": probing.axis, "ramp": 1e6, "current_limit": 1e3}
+                     "axis": probing.axis, "ramp": 1e6, "current_limit": 1e3, "period": _LOOK_S}
     return config_from({"motor": motor, "observer": observer, "injection": injection}, source=f"{watcher.kind}")
 
 

@@ -103,7 +103,8 @@ def run(names: Sequence[str], workers: int | None = None,
     tasks = [n for n in wanted if n in EXPERIMENTS]
     if COMPARISON in wanted:
         tasks += [s.name for s in SCENES]
-    workers = min(workers or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else workers or 1, len(tasks))
+    workers = min(workers or len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else workers or 1,
+                  len(tasks))
     done: dict[str, Result | list[Row]] = {}
 
     def note(name: str, gave: Result | list[Row]) -> None:

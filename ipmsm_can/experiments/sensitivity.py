@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.experiments import panels
 from ipmsm_can.experiments.bench import BENCH_WORDS, OMEGA_1000, PULSES, START, on_bench
-from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.experiments.measure import (
     VISIBLE_DEG,
     flux_time,
@@ -51,10 +51,10 @@ def _judge_tuning(f: Figures, small: str, middle: str, large: str) -> Verdict:
     if slower and worse:
         return Verdict(Status.REPRODUCED, why)
     if worse:
-        return Verdict(Status.CONDITION, f"{why} The degradation with the large value is there; the slower convergence with "
-                       "the small one is not. The filters, which settle with 1/α, rule the first moments, and after "
-                       f"them the slow poles stand at {', '.join(f'{x:.0f}' for x in poles)} 1/s: the small value is "
-                       "nearest to the best.")
+        return Verdict(Status.CONDITION, f"{why} The degradation with the large value is there; the slower "
+                       "convergence with the small one is not. The filters, which settle with 1/α, rule the first "
+                       f"moments, and after them the slow poles stand at {', '.join(f'{x:.0f}' for x in poles)} "
+                       "1/s: the small value is nearest to the best.")
     if slower:
         return Verdict(Status.CONDITION, why + " Slower with the small value; no degradation with the large one.")
     return Verdict(Status.NOT, why)
@@ -99,10 +99,11 @@ def _resistance_figures(tracks: Tracks) -> list[Figure]:
 def _judge_resistance(f: Figures) -> Verdict:
     share, most = f["time in which the two differ visibly, 1000 rpm"].value, f["largest difference, 1000 rpm"].value
     slow = f["rms at 10 rpm, 2 R"].value
-    why = (f"At 1000 rpm the two estimates differ by more than a plot shows ({VISIBLE_DEG:g}°) in {share:.1f} % of the time, "
-           f"by {most:.1f}° at worst, at the load steps.")
-    slow_words = (f" At 10 rpm and the rated torque, where ΔR i_q exceeds ω ψ_m, the estimate is {slow:.0f}° rms off with "
-                  f"2 R, {f['rms at 10 rpm, R'].value:.1f}° with R: robust is the speed and not the observer.")
+    why = (f"At 1000 rpm the two estimates differ by more than a plot shows ({VISIBLE_DEG:g}°) in {share:.1f} % of "
+           f"the time, by {most:.1f}° at worst, at the load steps.")
+    slow_words = (f" At 10 rpm and the rated torque, where ΔR i_q exceeds ω ψ_m, the estimate is {slow:.0f}° rms "
+                  f"off with 2 R, {f['rms at 10 rpm, R'].value:.1f}° with R: robust is the speed and not the "
+                  "observer.")
     if share > 10.0:
         return Verdict(Status.NOT, why + slow_words)
     return Verdict(Status.CONDITION if share > 1.0 or slow > VISIBLE_DEG else Status.REPRODUCED, why + slow_words)
@@ -112,15 +113,17 @@ def _inductance_figures(tracks: Tracks) -> list[Figure]:
     nominal, twice = tracks["L"], tracks["2 L"]
     m = PULSES.machine
     return [Figure("largest difference", _difference(nominal, twice, _AFTER), "°"),
-            Figure("atan(ΔL_q i_q / |x|) at the rated torque", math.degrees(math.atan2(m.L_q * m.rated_current, m.psi_m)), "°"),
+            Figure("atan(ΔL_q i_q / |x|) at the rated torque",
+                   math.degrees(math.atan2(m.L_q * m.rated_current, m.psi_m)), "°"),
             Figure("rms under pulses, L", rms(window(nominal, _AFTER)), "°"),
             Figure("rms under pulses, 2 L", rms(window(twice, _AFTER)), "°")]
 
 
 def _judge_inductance(f: Figures) -> Verdict:
     rms_2 = f["rms under pulses, 2 L"].value
-    why = (f"{rms_2:.1f}° rms instead of {f['rms under pulses, L'].value:.1f}°, at most {f['largest difference'].value:.1f}° "
-           f"apart; atan(ΔL_q i_q/|x|) says {f['atan(ΔL_q i_q / |x|) at the rated torque'].value:.1f}° for the rated torque.")
+    why = (f"{rms_2:.1f}° rms instead of {f['rms under pulses, L'].value:.1f}°, at most "
+           f"{f['largest difference'].value:.1f}° apart; atan(ΔL_q i_q/|x|) says "
+           f"{f['atan(ΔL_q i_q / |x|) at the rated torque'].value:.1f}° for the rated torque.")
     slight = rms_2 <= VISIBLE_DEG
     return Verdict(Status.REPRODUCED if slight else Status.NOT, why)
 
@@ -140,8 +143,8 @@ def _judge_flux(f: Figures) -> Verdict:
     why = "Added to the rms error: " + ", ".join(f"{value:+.3f}° by {name}" for name, value in added.items()) + "."
     if max(added, key=lambda name: added[name]) == "1.5 ψ_m":
         return Verdict(Status.REPRODUCED if acceptable else Status.NOT, why)
-    return Verdict(Status.NOT, why + " ψ_m is the least and not the most conspicuous of the three, as it has to be: it "
-                   "enters the observer only through l = ψ_m L0. The error is acceptable." if acceptable else why)
+    return Verdict(Status.NOT, why + " ψ_m is not the most conspicuous of the three, as it has to be: it enters "
+                   "the observer only through l = ψ_m L0." + (" The error is acceptable." if acceptable else ""))
 
 
 def _tuned(names: tuple[str, ...], watchers: tuple[Watcher, ...], setup: Setup = PULSES) -> tuple[Run, ...]:
@@ -153,7 +156,8 @@ EXPERIMENTS = (
     Experiment(
         "fig15", "Fig. 15", "γ = 20, 50, 200 at 1000 rpm",
         "Convergence is slower at γ = 20 than at 50; at γ = 200 performance degrades.", _SAME + "α = 5.",
-        _tuned(("γ 20", "γ 50", "γ 200"), tuple(Watcher(alpha=5.0, gamma=g, start=START) for g in (20.0, 50.0, 200.0))),
+        _tuned(("γ 20", "γ 50", "γ 200"),
+               tuple(Watcher(alpha=5.0, gamma=g, start=START) for g in (20.0, 50.0, 200.0))),
         _tuning_figures, lambda f: _judge_tuning(f, "γ 20", "γ 50", "γ 200"),
         lambda tracks: [panels.angle(tracks, 0.0, 0.12, "Start"), panels.angle(tracks, 0.5, 0.54, "Load step"),
                         panels.error(tracks, most=10.0)]),
@@ -166,8 +170,8 @@ EXPERIMENTS = (
                         panels.error(tracks, most=10.0)]),
     Experiment(
         "fig17", "Fig. 17", "Twice the resistance",
-        "It is almost impossible to observe any difference.", _SAME + "α = 5, γ = 50. Besides, 10 rpm at the rated torque (α = 10, "
-        "γ = 0.1), which the paper does not show.",
+        "It is almost impossible to observe any difference.", _SAME + "α = 5, γ = 50. Besides, 10 rpm at the rated "
+        "torque (α = 10, γ = 0.1), which the paper does not show.",
         (*_tuned(("R", "2 R"), (_NOMINAL, _told(_TWICE_R))),
          *_tuned(("R, 10 rpm", "2 R, 10 rpm"), (_CRAWL_NOMINAL, _told(_TWICE_R, _CRAWL_NOMINAL)), _CRAWL)),
         _resistance_figures, _judge_resistance,
