@@ -19,20 +19,20 @@ from ipmsm_can.cli.paper import as_data
 from ipmsm_can.config import OBSERVER_KINDS
 from ipmsm_can.drive.parameters import DriveNodeSettings, DriveParameters
 from ipmsm_can.drive.profile import Profile
-from ipmsm_can.experiments import bench, compare, draw, extraction, measure, page, sensitivity, simulations
+from ipmsm_can.experiments import bench, compare, draw, extraction, measure, page, simulations
 from ipmsm_can.experiments.errata import ERRATA
 from ipmsm_can.experiments.model import Figure, Probing, Run, Setup, Status, Watcher
 from ipmsm_can.experiments.rig import Track, companion_config, observe, record
 from ipmsm_can.experiments.run import COMPARISON, EXPERIMENTS, NAMES, Result, Results, run, run_experiment
 from ipmsm_can.experiments.solver import euler_angle
-from ipmsm_can.motor import M1, M2
+from ipmsm_can.motor import M1
 
 GOOD, HALF, NOT = Status.REPRODUCED, Status.CONDITION, Status.NOT
 VERDICTS = {
     "fig1": GOOD, "fig2": GOOD, "fig3": GOOD, "fig4": GOOD, "fig5": HALF, "fig6": HALF, "fig7": HALF, "fig9": GOOD,
     "fig10": HALF, "fig11": NOT, "fig12": GOOD, "fig13": HALF, "fig14": HALF, "fig15": HALF, "fig16": HALF,
-    "fig17": HALF, "fig18": GOOD, "fig19": NOT, "fig20": GOOD, "conditions": GOOD, "polarity": HALF, "gain-law": NOT,
-    "solver-step": NOT, "injection-time": NOT,
+    "fig17": HALF, "fig18": GOOD, "fig19": NOT, "fig20": GOOD, "conditions": GOOD, "polarity": HALF,
+    "gain-law": NOT, "solver-step": NOT, "injection-time": NOT,
 }
 """What the runs give; the paper's claim or explanation stands, stands with a condition, or does not."""
 
@@ -149,10 +149,12 @@ def test_lock_time_is_the_last_time_out_of_bounds() -> None:
 
 def test_margins_from_first_principles() -> None:
     drive = DriveParameters(sample_rate=5000.0, current_noise=0.02, adc_step=0.01, dead_time_voltage=0.5)
-    setup = Setup("m2", Profile(((0.0, 1.0),)), drive, DriveNodeSettings(encoder_counts=10_000), against_encoder=True)
+    setup = Setup("m2", Profile(((0.0, 1.0),)), drive, DriveNodeSettings(encoder_counts=10_000),
+                  against_encoder=True)
     sigma = math.sqrt(0.02**2 + 0.01**2 / 12 + 0.005**2 / 12)
     assert measure.current_sigma(setup) == pytest.approx(sigma)
-    assert measure.noise_deg(setup) == pytest.approx(math.hypot(math.degrees(12.9e-3 * sigma / 0.59), 0.108 / 12**0.5))
+    from_current = math.degrees(12.9e-3 * sigma / 0.59)
+    assert measure.noise_deg(setup) == pytest.approx(math.hypot(from_current, 0.108 / 12**0.5))
     assert measure.dead_time_deg(setup, 100.0) == pytest.approx(math.degrees(math.atan(2 / 3 / 100.0 / 0.59)))
 
 
@@ -164,18 +166,19 @@ def test_the_slow_pole_is_a_root(gamma: float, phi: float, w: float) -> None:
 
 
 def test_euler_with_a_small_step_is_the_paper_s_observer() -> None:
-    """At the nominal gains the reference and the estimator agree, the more the smaller the step."""
+    """Under a load that makes d count for a degree and a half, the two agree in proportion to the step."""
+    heavy = Profile(((0.0, 10.0),), ((0.0, 9.0),), 0.4)
     apart = []
     for rate in (20_000.0, 80_000.0):
-        setup = replace(simulations.RAMP, drive=DriveParameters(sample_rate=rate, current_noise=0.0))
-        s = record(setup).truth
+        drive = DriveParameters(sample_rate=rate, current_noise=0.0, speed_imposed=True)
+        s = record(replace(simulations.RAMP, profile=heavy, drive=drive)).truth
         samples = np.array([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
-        theta = euler_angle(M1, samples, rate, 20.0, 10.0, (0.5, 2.0))
-        here = estimate(samples[:2].T, samples[2:].T, rate, M1, alpha=20.0, gamma=10.0, initial_flux=(0.5, 2.0))
+        theta = euler_angle(M1, samples, rate, 20.0, 10.0, (0.05, 0.1))
+        here = estimate(samples[:2].T, samples[2:].T, rate, M1, alpha=20.0, gamma=10.0, initial_flux=(0.05, 0.1))
         off = np.angle(np.exp(1j * (theta - here.theta)))
-        apart.append(np.degrees(np.abs(off[s.sample > 0.05 * rate])).max())
-    assert apart[1] < 0.4 * apart[0]
-    assert apart[1] < 1.5
+        apart.append(np.degrees(np.abs(off[s.sample > 0.02 * rate])).max())
+    assert apart[1] < 0.06
+    assert apart[0] == pytest.approx(4.0 * apart[1], rel=0.1)
 
 
 # ---- verdicts -----------------------------------------------------------------------------------------
@@ -218,7 +221,8 @@ def test_bench_runs_within_noise_and_dead_time(results: Results) -> None:
     ideal = figures(results, "fig9")["largest from 0.5 s on, no dead time"]
     assert ideal.margin is not None and 0.02 < ideal.value < ideal.margin
     assert value(results, "fig9", "largest from 0.5 s on, 5 kHz") < 2.5
-    assert value(results, "fig10", "rms at 1000 rpm, γ 0.5") < measure.margin_deg(bench.ACCELERATED, bench.OMEGA_1000)
+    margin = measure.margin_deg(bench.ACCELERATED, bench.OMEGA_1000)
+    assert value(results, "fig10", "rms at 1000 rpm, γ 0.5") < margin
     slow = figures(results, "fig13")["rms from 3 s on, published gains"]
     assert slow.margin is not None and slow.value < slow.margin
 
@@ -226,12 +230,14 @@ def test_bench_runs_within_noise_and_dead_time(results: Results) -> None:
 def test_injection_s_time_is_the_formula_s(results: Results) -> None:
     for gamma in (1000, 2000, 5000):
         formula = value(results, "injection-time", f"1/(2γα²L0²⟨i_q²⟩), γ {gamma}")
-        assert value(results, "injection-time", f"time constant measured, γ {gamma}") == pytest.approx(formula, rel=0.1)
+        measured = value(results, "injection-time", f"time constant measured, γ {gamma}")
+        assert measured == pytest.approx(formula, rel=0.1)
     assert value(results, "injection-time", "1/(2γα²L0²⟨i_q²⟩) at the published γ 50, α 10") > 60.0
 
 
 def test_polarity_at_standstill(results: Results) -> None:
-    end = {s: abs(value(results, "polarity", f"angle error at the end, from {s}°")) for s in (30, 60, 120, 150, 180)}
+    end = {s: abs(value(results, "polarity", f"angle error at the end, from {s}°"))
+           for s in (30, 60, 120, 150, 180)}
     assert end[30] < 20.0 and end[60] < 20.0
     assert min(end[s] for s in (120, 150, 180)) > 160.0
     assert value(results, "polarity", "share of samples the companion called valid") == 0.0
@@ -241,7 +247,8 @@ def test_psi_m_matters_least_of_the_three(results: Results) -> None:
     added = [value(results, "fig19", f"rms added by {name}") for name in ("1.5 ψ_m", "2 R", "2 L")]
     assert abs(added[0]) < 0.05 < added[1] < added[2]
     predicted = value(results, "fig18", "atan(ΔL_q i_q / |x|) at the rated torque")
-    assert value(results, "fig18", "rms under pulses, 2 L") < predicted < value(results, "fig18", "largest difference")
+    found = [value(results, "fig18", what) for what in ("rms under pulses, 2 L", "largest difference")]
+    assert found[0] < predicted < found[1]
 
 
 @pytest.mark.parametrize(("name", "change", "expected"), [
@@ -465,14 +472,16 @@ def test_trouble_is_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
 def test_gains_the_paper_names() -> None:
     """The gains, starts and injections of Sections 5.1 and 5.2, as printed."""
-    first = {name: EXPERIMENTS[name].runs[-1 if name == "fig6" else 0] for name in EXPERIMENTS}
-    gains = {name: (r.watcher.alpha, r.watcher.gamma) for name, r in first.items()}
-    assert gains["fig2"] == (20, 10) and gains["fig5"] == (200, 10) and gains["fig6"] == (20, 100)
-    assert gains["fig9"] == (5, 50) and gains["fig10"] == gains["fig13"] == (10, 50) and gains["fig20"] == (50, 50)
-    assert [r.watcher.gamma for r in EXPERIMENTS["fig15"].runs] == [20, 50, 200]
-    assert [r.watcher.alpha for r in EXPERIMENTS["fig16"].runs] == [2, 5, 10]
-    assert first["fig2"].watcher.start == first["fig9"].watcher.start == (0.5, 2.0)
-    assert first["fig13"].setup.probing == Probing(6.0, 400.0)
-    assert EXPERIMENTS["fig11"].runs[1].setup.probing == Probing(4.0, 400.0)
-    assert sensitivity._TWICE_L == (("L_d", 2.0), ("L_q", 2.0))
-    assert (M1.pole_pairs, M2.pole_pairs) == (6, 3)
+    gains = {name: [(r.watcher.alpha, r.watcher.gamma) for r in e.runs] for name, e in EXPERIMENTS.items()}
+    printed = {"fig2": (20, 10), "fig5": (200, 10), "fig9": (5, 50), "fig10": (10, 50), "fig13": (10, 50),
+               "fig20": (50, 50)}
+    assert {name: gains[name][0] for name in printed} == printed
+    assert gains["fig6"][1] == (20, 100)
+    assert [gamma for _, gamma in gains["fig15"]] == [20, 50, 200]
+    assert [alpha for alpha, _ in gains["fig16"]] == [2, 5, 10]
+    for name in ("fig2", "fig9"):
+        assert EXPERIMENTS[name].runs[0].watcher.start == (0.5, 2.0)
+    probed = [EXPERIMENTS[name].runs[k].setup.probing for name, k in (("fig13", 0), ("fig11", 1))]
+    assert probed == [Probing(6.0, 400.0), Probing(4.0, 400.0)]
+    told = [dict(EXPERIMENTS[name].runs[1].watcher.scale) for name in ("fig17", "fig18", "fig19")]
+    assert told == [{"R": 2.0}, {"L_d": 2.0, "L_q": 2.0}, {"psi_m": 1.5}]
