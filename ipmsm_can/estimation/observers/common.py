@@ -14,37 +14,9 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.filters import filter_coefficients
+from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
 from ipmsm_can.motor import Motor
 
-GES = 0
-RICCATI = 1
-SPMSM_GRADIENT = 2
-SPMSM_GRADIENT_MAX = 3
-SPMSM_REGRESSION = 4
-ACTIVE_FLUX_REGRESSION = 5
-CHONAM = 6
-INJECTION_EXTRACTION = 7
-INJECTION_DEMODULATION = 8
-
-KINDS = {
-    "ges": GES,
-    "spmsm_gradient": SPMSM_GRADIENT,
-    "spmsm_gradient_max": SPMSM_GRADIENT_MAX,
-    "spmsm_regression": SPMSM_REGRESSION,
-    "active_flux_regression": ACTIVE_FLUX_REGRESSION,
-    "chonam": CHONAM,
-    "injection_extraction": INJECTION_EXTRACTION,
-    "injection_demodulation": INJECTION_DEMODULATION,
-}
-"""Name in a configuration -> number on the wire (CompanionStatus.observer)."""
-
-NON_SALIENT = (SPMSM_GRADIENT, SPMSM_GRADIENT_MAX, SPMSM_REGRESSION)
-"""Kinds that take the machine for one with L_d = L_q = L_s."""
-MODULO_PI = (INJECTION_EXTRACTION, INJECTION_DEMODULATION)
-"""Kinds that see the rotor's axis and not which of its ends is north."""
-
-WINDOW_CAPACITY = 512
-"""Samples that the window of `injection_extraction` can hold."""
 _MOST_PERIODS = 16
 _FILTER_PERIODS = 4.0
 """Time constant of the demodulation's low-pass, in periods of the probing signal."""

@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers.common import SPMSM_GRADIENT_MAX
+from ipmsm_can.estimation.observers.kinds import SPMSM_GRADIENT_MAX
 
 
 @kernel
 def _scale(rho: float, psi2: float, rest: float, only_longer: bool) -> float:
-    """Factor on x_hat over half an interval; rho = |x_hat|^2, psi2 = psi_m^2 [Wb^2], rest = exp(-2 gamma psi2 h)."""
+    """Factor on x_hat over a time h; rho = |x_hat|^2, psi2 = psi_m^2 [Wb^2], rest = exp(-2 gamma psi2 h)."""
     if rho < 1e-18 * psi2 or (only_longer and rho <= psi2):
         return 1.0  # a point has no direction to grow in
     return math.sqrt(psi2 / (rho * (1.0 - rest) + psi2 * rest))
