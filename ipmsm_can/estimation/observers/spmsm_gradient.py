@@ -58,6 +58,7 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
     l_b = st.lambda_b
     kick_a = st.kick_a
     kick_b = st.kick_b
+    started = st.started
     for k in range(samples.shape[1]):
         i_a = samples[0, k]
         i_b = samples[1, k]
@@ -68,7 +69,9 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
         phi = math.sqrt(regression[1, k] * regression[1, k] + regression[2, k] * regression[2, k])
         out[4, k] = phi * (psi_m - math.sqrt(rho))
         out[5, k] = 0.0 if only_longer and rho <= psi2 else gain
-        m = _scale(rho, psi2, rest, only_longer)
+        # No interval has ended at the first sample: only the one that begins gets its half.
+        m = _scale(rho, psi2, rest, only_longer) if started else 1.0
+        started = 1
         x_a *= m
         x_b *= m
         l_a = x_a + L * i_a
@@ -84,6 +87,7 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
     st.lambda_b = l_b
     st.kick_a = kick_a
     st.kick_b = kick_b
+    st.started = started
     if samples.shape[1] > 0:
         st.x_a = out[2, samples.shape[1] - 1]
         st.x_b = out[3, samples.shape[1] - 1]
