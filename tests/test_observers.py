@@ -192,7 +192,7 @@ def test_what_neglecting_d_costs() -> None:
 
 def test_lambda_of_chonam_is_the_gradient_that_ges_leaves_out() -> None:
     """Without saliency the two are the same observer; with it they take different ways to the same angle."""
-    keys = {"initial_flux": [0.5, 2.0], "gamma": 0.5}
+    keys: dict[str, Any] = {"initial_flux": [0.5, 2.0], "gamma": 0.5}
     same = [run(kind, Rotating(SURFACE, 60.0, 0.0, 2.3), **keys).flux[:4] for kind in ("ges", "chonam")]
     assert np.abs(same[0] - same[1]).max() < 1e-12
     machine = Rotating(M2, 60.0, 0.0, 2.3)

@@ -275,9 +275,6 @@ class DriveConfig(BaseModel):
         if self.epsilon >= psi_m:
             raise KeyProblem("observer.epsilon", f"a flux below the motor's psi_m, {psi_m:g} Wb")
         rate = self.wire.sample_rate
-        if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
-            raise KeyProblem(
-                "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")
         if rate is not None and self.observer.kind.startswith("injection_"):
             # A window of whole periods, of samples that are faster than two a period.
             low = rate / WINDOW_CAPACITY if self.observer.kind == "injection_extraction" else 0.0
@@ -285,6 +282,9 @@ class DriveConfig(BaseModel):
                 raise KeyProblem(
                     "injection.frequency", f"a frequency from {low:g} Hz to below half of the sample rate of "
                     f"{rate:g} Hz, for observer.kind {self.observer.kind}")
+        if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
+            raise KeyProblem(
+                "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")
         if (self.injection.enabled and self.injection.current_limit is None
                 and self.motor.preset is None and self.motor.rated_torque is None):
             # Motor's own default torque belongs to the paper's machines: no basis for a limit elsewhere.

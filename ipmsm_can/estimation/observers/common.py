@@ -18,8 +18,8 @@ from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIE
 from ipmsm_can.motor import Motor
 
 _MOST_PERIODS = 16
-_FILTER_PERIODS = 4.0
-"""Time constant of the demodulation's low-pass, in periods of the probing signal."""
+_FILTER_PERIODS = 2.0
+"""Time constant of each of the demodulation's two low-passes, in periods of the probing signal."""
 
 PARAMETERS = np.dtype([
     ("kind", "i8"),
@@ -39,7 +39,7 @@ STATE = np.dtype([
     ("u_a", "f8"), ("u_b", "f8"), ("f_u_a", "f8"), ("f_u_b", "f8"),
     # Injection: last angle [rad], whether it was ever seen, phase of the reference [rad].
     ("theta", "f8"), ("known", "i8"), ("phase", "f8"), ("count", "i8"), ("slot", "i8"),
-    ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (4,)),
+    ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (8,)),
     ("sums", "c16", (7,)), ("fresh", "c16", (7,)), ("ring", "c16", (WINDOW_CAPACITY, 3)),
 ])
 
@@ -104,10 +104,10 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
 
 
 def injection_delay(kind: int, injection_frequency: float, sample_rate: float) -> float:
-    """Age [s] of the angle of a kind in MODULO_PI: half the window, or the low-pass's time constant."""
+    """Age [s] of the angle of a kind in MODULO_PI: half the window, or the low-passes' time constants."""
     if kind == INJECTION_EXTRACTION:
         return 0.5 * window_length(injection_frequency, sample_rate) / sample_rate
-    return _FILTER_PERIODS / injection_frequency
+    return 2.0 * _FILTER_PERIODS / injection_frequency
 
 
 def new_state(lambda_a: float, lambda_b: float, theta: float) -> NDArray[np.void]:
