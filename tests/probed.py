@@ -29,7 +29,7 @@ def locked_rotor(motor: Motor, theta: float, v: NDArray[np.complex128], rate: fl
 def injection(kind: str, amplitude: float, frequency: float, rate: float, n: int) -> NDArray[np.complex128]:
     """Held voltages (n,) of a probing signal: "rotating" or "alpha" (sin(w_h t) on the alpha axis)."""
     phase = 2 * np.pi * frequency * (np.arange(n) + 0.5) / rate
-    return amplitude * (np.exp(1j * phase) if kind == "rotating" else np.sin(phase) + 0j)
+    return np.asarray(amplitude * (np.exp(1j * phase) if kind == "rotating" else np.sin(phase) + 0j))
 
 
 def turning(motor: Motor, w: float, i_q: float, probing: NDArray[np.complex128], rate: float,
@@ -41,7 +41,8 @@ def turning(motor: Motor, w: float, i_q: float, probing: NDArray[np.complex128],
     n = probing.size
     flux_dq = motor.psi_m + 1j * motor.L_q * i_q
     lam = complex(flux_dq * np.exp(1j * theta_0))
-    out, theta = np.zeros((4, n)), w * np.arange(n) / rate + theta_0
+    out = np.zeros((4, n))
+    theta: Floats = np.asarray(w * np.arange(n) / rate + theta_0, np.float64)
 
     def current(flux: complex, angle: float) -> complex:
         x = flux * np.exp(-1j * angle)

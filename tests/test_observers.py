@@ -79,13 +79,14 @@ def continuous(kind: str, machine: Rotating, alpha: float, gamma: float, initial
         along, u = part(i, x) / abs(x), gradient(i, x)
         too_long = abs(x) ** 2 - m.psi_m**2
         d_hat = -ell * alpha * (along - f_s)
-        step = {
-            "spmsm_gradient": lambda: -gamma * too_long * x,
-            "spmsm_gradient_max": lambda: -gamma * max(0.0, too_long) * x,
-            "spmsm_regression": lambda: gamma * phi * (y - part(phi, x)),
-            "active_flux_regression": lambda: gamma * phi * (y - part(phi, x)),
-            "chonam": lambda: gamma * (phi - ell * alpha * (u - f_u)) * (y - part(phi, x) - d_hat),
-        }[kind]()
+        if kind == "spmsm_gradient":
+            step = -gamma * too_long * x
+        elif kind == "spmsm_gradient_max":
+            step = -gamma * max(0.0, too_long) * x
+        elif kind == "chonam":
+            step = gamma * (phi - ell * alpha * (u - f_u)) * (y - part(phi, x) - d_hat)
+        else:
+            step = gamma * phi * (y - part(phi, x))
         d_lam, d_e, d_i, d_u = e + step, alpha * (e - f_e), alpha * (i - f_i), alpha * (u - f_u)
         return [d_e.real, d_e.imag, d_i.real, d_i.imag, -alpha * g + part(om2, om1), d_lam.real, d_lam.imag,
                 alpha * (along - f_s), d_u.real, d_u.imag]
