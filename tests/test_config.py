@@ -322,6 +322,15 @@ def test_a_configuration_is_frozen() -> None:
             setattr(owner, name, 1)
 
 
+def test_the_default_gain_is_in_the_unit_of_the_observers_equation() -> None:
+    psi_m = M2.psi_m
+    for kind, gamma in (("ges", 70.0 / (20.0 * psi_m) ** 2), ("chonam", 70.0 / (20.0 * psi_m) ** 2),
+                        ("spmsm_gradient", 35.0 / psi_m**2), ("spmsm_gradient_max", 35.0 / psi_m**2)):
+        text = f'{M2_ONLY}[observer]\nkind = "{kind}"\n'
+        assert parse_config(text).gamma == pytest.approx(gamma)
+        assert parse_config(text + "gamma = 3\n").gamma == 3.0
+
+
 def test_the_one_list_of_observers() -> None:
     for kind in OBSERVER_KINDS:
         assert parse_config(f'{M2_ONLY}[observer]\nkind = "{kind}"\n').observer.kind == kind

@@ -17,6 +17,7 @@ from ipmsm_can.config import units
 from ipmsm_can.config.keys import Choice, FilePath, Quantity, Switch
 from ipmsm_can.config.section import KeyProblem, Section
 from ipmsm_can.config.simulation import CLASSICAL_RATE, FD_RATE, SimulationConfig
+from ipmsm_can.estimation.observers.kinds import WINDOW_CAPACITY
 from ipmsm_can.motor import PRESETS, Motor
 
 ObserverKind = Literal["ges", "spmsm_gradient", "spmsm_gradient_max", "spmsm_regression", "active_flux_regression",
@@ -278,6 +279,13 @@ class DriveConfig(BaseModel):
         if self.epsilon >= psi_m:
             raise KeyProblem("observer.epsilon", f"a flux below the motor's psi_m, {psi_m:g} Wb")
         rate = self.wire.sample_rate
+        if rate is not None and self.observer.kind.startswith("injection_"):
+            # A window of whole periods, of samples that are faster than two a period.
+            low = rate / WINDOW_CAPACITY if self.observer.kind == "injection_extraction" else 0.0
+            if not low <= self.injection.frequency < rate / 2:
+                raise KeyProblem(
+                    "injection.frequency", f"a frequency from {low:g} Hz to below half of the sample rate of "
+                    f"{rate:g} Hz, for observer.kind {self.observer.kind}")
         if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
             raise KeyProblem(
                 "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")

@@ -41,7 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers import common
+from ipmsm_can.estimation.observers import kinds
+from ipmsm_can.estimation.observers.common import assumed_motor, injection_delay
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -69,13 +70,13 @@ STATE = np.dtype([
     ("p_aa", "f8"), ("p_ab", "f8"), ("p_bb", "f8"),
     ("test", "f8"), ("contraction", "f8"), ("locked", "i8"), ("polarity", "i8"), ("lost", "i8"),
     # What the kind of observer adds; zeros for ges.
-    ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"), ("across", "f8"),
-    ("neglected", "f8"), ("spread", "f8"),
+    ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
+    ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
 ])
 
 
 def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: float, current_noise: float,
-              sigma_limit: float, sample_rate: float, kind: int = common.GES,
+              sigma_limit: float, sample_rate: float, kind: int = kinds.GES,
               injection_frequency: float = 400.0) -> NDArray[np.void]:
     """Record array (1,) of STATE for the real motor, whatever an observer of this kind takes it for.
 
@@ -93,18 +94,18 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
     st["voltage"] = 2.0 * motor.psi_m * voltage_uncertainty
     st["white"] = (2.0 * alpha * motor.psi_m * motor.L_s * current_noise) ** 2
     st["sigma_limit"] = sigma_limit
-    st["L"] = common.assumed_motor(kind, motor).L_q
-    st["radial"] = kind in (common.SPMSM_GRADIENT, common.SPMSM_GRADIENT_MAX)
-    st["slips"] = kind == common.SPMSM_GRADIENT
-    if kind in common.NON_SALIENT:
+    st["L"] = assumed_motor(kind, motor).L_q
+    st["radial"] = kind in (kinds.SPMSM_GRADIENT, kinds.SPMSM_GRADIENT_MAX)
+    st["slips"] = kind == kinds.SPMSM_GRADIENT
+    if kind in kinds.NON_SALIENT:
         st["across"] = 0.5 * abs(motor.L_0)
-    if kind in (common.SPMSM_REGRESSION, common.ACTIVE_FLUX_REGRESSION):
+    if kind in (kinds.SPMSM_REGRESSION, kinds.ACTIVE_FLUX_REGRESSION):
         st["neglected"] = abs(motor.ell)
-    if kind == common.CHONAM:
+    if kind == kinds.CHONAM:
         st["spread"] = abs(motor.ell)
-    if kind in common.MODULO_PI:
+    if kind in kinds.MODULO_PI:
         st["axis_only"] = 1
-        st["delay"] = common.injection_delay(kind, injection_frequency, sample_rate)
+        st["delay"] = injection_delay(kind, injection_frequency, sample_rate)
     return state
 
 

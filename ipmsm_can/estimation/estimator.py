@@ -13,7 +13,9 @@ from ipmsm_can._jit import kernel
 from ipmsm_can.estimation import confidence, excitation, regression, speed
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
-from ipmsm_can.estimation.observers import common, observer_block
+from ipmsm_can.estimation.observers import common
+from ipmsm_can.estimation.observers.dispatch import observer_block
+from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.estimation.regression import regression_block
 from ipmsm_can.estimation.speed import speed_block
 from ipmsm_can.motor import Motor
@@ -31,7 +33,7 @@ _SPEED_DOUBT = 0.1
 class EstimatorSettings:
     """What the estimator needs to know besides the motor; the defaults live in the configuration model.
 
-    kind: name of the observer, a key of `observers.common.KINDS`.  alpha [1/s], gamma in the unit of the
+    kind: name of the observer, a key of `observers.kinds.KINDS`.  alpha [1/s], gamma in the unit of the
     observer's own equation, initial_flux [Wb, Wb], epsilon [Wb];
     excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
     valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
@@ -100,7 +102,7 @@ class Estimator:
         self.sample_rate = sample_rate
         self.settings = settings
         s = settings
-        kind = common.KINDS[s.kind]
+        kind = KINDS[s.kind]
         self._assumed = common.assumed_motor(kind, motor)
         self._regression_parameters = regression.parameters(self._assumed, s.alpha, sample_rate)
         self._regression = np.zeros(1, regression.STATE)

@@ -14,40 +14,12 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.filters import filter_coefficients
+from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
 from ipmsm_can.motor import Motor
 
-GES = 0
-RICCATI = 1
-SPMSM_GRADIENT = 2
-SPMSM_GRADIENT_MAX = 3
-SPMSM_REGRESSION = 4
-ACTIVE_FLUX_REGRESSION = 5
-CHONAM = 6
-INJECTION_EXTRACTION = 7
-INJECTION_DEMODULATION = 8
-
-KINDS = {
-    "ges": GES,
-    "spmsm_gradient": SPMSM_GRADIENT,
-    "spmsm_gradient_max": SPMSM_GRADIENT_MAX,
-    "spmsm_regression": SPMSM_REGRESSION,
-    "active_flux_regression": ACTIVE_FLUX_REGRESSION,
-    "chonam": CHONAM,
-    "injection_extraction": INJECTION_EXTRACTION,
-    "injection_demodulation": INJECTION_DEMODULATION,
-}
-"""Name in a configuration -> number on the wire (CompanionStatus.observer)."""
-
-NON_SALIENT = (SPMSM_GRADIENT, SPMSM_GRADIENT_MAX, SPMSM_REGRESSION)
-"""Kinds that take the machine for one with L_d = L_q = L_s."""
-MODULO_PI = (INJECTION_EXTRACTION, INJECTION_DEMODULATION)
-"""Kinds that see the rotor's axis and not which of its ends is north."""
-
-WINDOW_CAPACITY = 512
-"""Samples that the window of `injection_extraction` can hold."""
 _MOST_PERIODS = 16
-_FILTER_PERIODS = 4.0
-"""Time constant of the demodulation's low-pass, in periods of the probing signal."""
+_FILTER_PERIODS = 2.0
+"""Time constant of each of the demodulation's two low-passes, in periods of the probing signal."""
 
 PARAMETERS = np.dtype([
     ("kind", "i8"),
@@ -67,7 +39,7 @@ STATE = np.dtype([
     ("u_a", "f8"), ("u_b", "f8"), ("f_u_a", "f8"), ("f_u_b", "f8"),
     # Injection: last angle [rad], whether it was ever seen, phase of the reference [rad].
     ("theta", "f8"), ("known", "i8"), ("phase", "f8"), ("count", "i8"), ("slot", "i8"),
-    ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (4,)),
+    ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (8,)),
     ("sums", "c16", (7,)), ("fresh", "c16", (7,)), ("ring", "c16", (WINDOW_CAPACITY, 3)),
 ])
 
@@ -132,10 +104,10 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
 
 
 def injection_delay(kind: int, injection_frequency: float, sample_rate: float) -> float:
-    """Age [s] of the angle of a kind in MODULO_PI: half the window, or the low-pass's time constant."""
+    """Age [s] of the angle of a kind in MODULO_PI: half the window, or the low-passes' time constants."""
     if kind == INJECTION_EXTRACTION:
         return 0.5 * window_length(injection_frequency, sample_rate) / sample_rate
-    return _FILTER_PERIODS / injection_frequency
+    return 2.0 * _FILTER_PERIODS / injection_frequency
 
 
 def new_state(lambda_a: float, lambda_b: float, theta: float) -> NDArray[np.void]:

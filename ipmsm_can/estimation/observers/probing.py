@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import cmath
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,7 @@ def axis_sigma(b: complex, i_p: complex, i_n: complex, flux_p: complex, flux_n: 
 
 
 @kernel
-def put_axis(b: complex, sigma: float, i_a: float, i_b: float, p: NDArray[np.void], st: NDArray[np.void],
+def put_axis(b: complex, sigma: float, i_a: float, i_b: float, p: Any, st: Any,
              out: NDArray[np.float64], k: int) -> None:
     """Write row k: the flux of a magnet along the axis nearest to the last angle; p, st: single records.
 

@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers.common import SPMSM_GRADIENT_MAX
+from ipmsm_can.estimation.observers.kinds import SPMSM_GRADIENT_MAX
 
 
 @kernel
 def _scale(rho: float, psi2: float, rest: float, only_longer: bool) -> float:
-    """Factor on x_hat over half an interval; rho = |x_hat|^2, psi2 = psi_m^2 [Wb^2], rest = exp(-2 gamma psi2 h)."""
+    """Factor on x_hat over a time h; rho = |x_hat|^2, psi2 = psi_m^2 [Wb^2], rest = exp(-2 gamma psi2 h)."""
     if rho < 1e-18 * psi2 or (only_longer and rho <= psi2):
         return 1.0  # a point has no direction to grow in
     return math.sqrt(psi2 / (rho * (1.0 - rest) + psi2 * rest))
@@ -58,6 +58,7 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
     l_b = st.lambda_b
     kick_a = st.kick_a
     kick_b = st.kick_b
+    started = st.started
     for k in range(samples.shape[1]):
         i_a = samples[0, k]
         i_b = samples[1, k]
@@ -68,7 +69,9 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
         phi = math.sqrt(regression[1, k] * regression[1, k] + regression[2, k] * regression[2, k])
         out[4, k] = phi * (psi_m - math.sqrt(rho))
         out[5, k] = 0.0 if only_longer and rho <= psi2 else gain
-        m = _scale(rho, psi2, rest, only_longer)
+        # No interval has ended at the first sample: only the one that begins gets its half.
+        m = _scale(rho, psi2, rest, only_longer) if started else 1.0
+        started = 1
         x_a *= m
         x_b *= m
         l_a = x_a + L * i_a
@@ -84,6 +87,7 @@ def spmsm_gradient_block(samples: NDArray[np.float64], regression: NDArray[np.fl
     st.lambda_b = l_b
     st.kick_a = kick_a
     st.kick_b = kick_b
+    st.started = started
     if samples.shape[1] > 0:
         st.x_a = out[2, samples.shape[1] - 1]
         st.x_b = out[3, samples.shape[1] - 1]
