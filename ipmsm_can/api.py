@@ -50,13 +50,16 @@ class Estimate:
 
 
 def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str, observer: str = "ges",
-             valid_sigma: float | None = None, **gains: Any) -> Estimate:
+             valid_sigma: float | None = None, injection_frequency: float | str | None = None,
+             **gains: Any) -> Estimate:
     """Estimate rotor position from sampled currents and voltages.
 
     i: stator current at the sample instants [A peak], alpha-beta, shape (N, 2) or complex (N,).
     v: MEAN stator voltage over the interval that ended at each sample [V peak], same shape.
     sample_rate [Hz], 100..100000.  motor: a Motor, or the name of a preset ("m1", "m2").
-    observer: its kind.  valid_sigma: largest 1-sigma of a valid angle [deg electrical].
+    observer: its kind, see [observer] in drive.toml and docs/estimation.md.
+    valid_sigma: largest 1-sigma of a valid angle [deg electrical].
+    injection_frequency: of the probing signal [Hz], for the kinds injection_extraction and injection_demodulation.
     gains: the other keys of [observer] in drive.toml: alpha, gamma, initial_flux, epsilon,
     excitation_window, speed_bandwidth, voltage_uncertainty, current_noise; numbers in SI or strings with units.
 
@@ -79,6 +82,9 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
                                                           "rated_torque")},
         "observer": {"kind": observer, **gains},
         "estimate": {} if valid_sigma is None else {"valid_sigma": valid_sigma},
+        "injection": {} if injection_frequency is None else {"frequency": injection_frequency},
+        # The sample rate only matters for what the injection may be; other kinds do not look at that.
+        "wire": {"sample_rate": float(sample_rate)} if str(observer).startswith("injection_") else {},
     }, source="estimate()")
     samples = np.ascontiguousarray(np.concatenate([current, voltage]))
     block = Estimator(motor, float(sample_rate), estimator_settings(config)).process(samples)

@@ -40,7 +40,7 @@ def config(node: int = 0, **sections: dict[str, object]) -> DriveConfig:
 
 
 def drive(node: int = 0, track: profile.Profile | None = None, fd: bool = False, rate: float = RATE,
-          **rates: float) -> DriveNode:
+          **rates: Any) -> DriveNode:
     simulation = DriveSimulation(M2, DriveParameters(sample_rate=rate), track or profile.torque_pulses(),
                                  theta_0=0.5 * node, seed=node)
     return DriveNode(PROTOCOL, node, simulation, DriveNodeSettings(fd=fd, **rates))

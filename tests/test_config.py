@@ -61,7 +61,7 @@ def test_defaults() -> None:
     assert config.injection.model_dump() == {
         "enabled": True, "waveform": "rotating", "amplitude": 6.0, "frequency": 400.0, "speed_on": 40.0,
         "speed_off": 60.0, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0, "current_limit": None,
-        "time_to_live": 0.1, "period": 0.02,
+        "time_to_live": 0.1, "period": 0.02, "axis": None,
     }
 
 
@@ -159,7 +159,7 @@ WRONG = [
     (M2_ONLY + "[wire]\nmax_gap = '" + 500 * "x" + "'", 'wire.max_gap is "xxxxx'),
     (M2_ONLY + "[wire]\ndbc = 'no-such.dbc'",
      'wire.dbc is "no-such.dbc"; allowed is the path of a file that exists'),
-    (M2_ONLY + "[observer]\nkind = 'riccati'", 'observer.kind is "riccati"; allowed is "ges"'),
+    (M2_ONLY + "[observer]\nkind = 'luenberger'", 'observer.kind is "luenberger"; allowed is "ges", "spmsm_'),
     (M2_ONLY + "[observer]\ninitial_flux = [1]",
      "observer.initial_flux is [1]; allowed is an array of 2 values"),
     (M2_ONLY + "[observer]\ncurrent_noise = 0", "observer.current_noise is 0; allowed is a number of A rms"),
@@ -322,6 +322,15 @@ def test_a_configuration_is_frozen() -> None:
             setattr(owner, name, 1)
 
 
+def test_the_default_gain_is_in_the_unit_of_the_observers_equation() -> None:
+    psi_m = M2.psi_m
+    for kind, gamma in (("ges", 70.0 / (20.0 * psi_m) ** 2), ("chonam", 70.0 / (20.0 * psi_m) ** 2),
+                        ("spmsm_gradient", 35.0 / psi_m**2), ("spmsm_gradient_max", 35.0 / psi_m**2)):
+        text = f'{M2_ONLY}[observer]\nkind = "{kind}"\n'
+        assert parse_config(text).gamma == pytest.approx(gamma)
+        assert parse_config(text + "gamma = 3\n").gamma == 3.0
+
+
 def test_the_one_list_of_observers() -> None:
     for kind in OBSERVER_KINDS:
         assert parse_config(f'{M2_ONLY}[observer]\nkind = "{kind}"\n').observer.kind == kind
@@ -351,7 +360,8 @@ def test_every_key_of_the_simulated_drive_arrives() -> None:
         "current_noise": 0.03, "current_offset": (0.1, -0.2), "adc_step": 0.005, "friction": 0.001,
         "speed_imposed": True, "rotor_locked": False, "injection_limit": 20.0, "injection_ramp": 500.0,
     }
-    sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0}
+    sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0,
+            "encoder_counts": 4096}
     config = config_from({"motor": {"preset": "m2"}, "simulation": {**given, **sent}})
     assert drive_parameters(config) == DriveParameters(**given)  # type: ignore[arg-type]
     assert drive_node_settings(config) == DriveNodeSettings(**sent)  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ DATABASE: Any = cantools.database.load_file(default_dbc_path())
 RATE = 5000.0
 
 
-def drive(node: int = 0, fd: bool = False, rate: float = RATE, limit: float = 30.0, **rates: float) -> DriveNode:
+def drive(node: int = 0, fd: bool = False, rate: float = RATE, limit: float = 30.0, **rates: Any) -> DriveNode:
     parameters = DriveParameters(sample_rate=rate, injection_limit=limit)
     simulation = DriveSimulation(M2, parameters, profile.torque_pulses())
     return DriveNode(PROTOCOL, node, simulation, DriveNodeSettings(fd=fd, **rates))
@@ -106,6 +106,15 @@ def test_the_other_messages_and_their_rates() -> None:
         k = r["sample_counter"]
         assert abs(math.remainder(r["theta_e"] - step.samples.theta_e[k], math.tau)) <= 4.8e-5
         assert abs(r["omega_e"] - step.samples.omega_e[k]) <= 0.126
+
+
+def test_encoder_of_finite_resolution_rounds_to_its_own_steps() -> None:
+    step = drive(reference_rate=500.0, encoder_counts=6144).step(5000)
+    grid = math.tau * M2.pole_pairs / 6144
+    told = np.array([r["theta_e"] for r in read(step, "DriveReference")])
+    off = np.angle(np.exp(1j * (told - step.samples.theta_e[::10])))
+    assert np.abs(np.angle(np.exp(1j * (told - grid * np.round(told / grid))))).max() <= 1e-4
+    assert 0.45 * grid < np.abs(off).max() <= 0.5 * grid + 1e-4
 
 
 def test_rates_of_zero_are_silence() -> None:

@@ -6,6 +6,7 @@ import csv
 import math
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ def protocol() -> Protocol:
 
 
 def drive_frames(protocol: Protocol, seconds: float, node: int = 0, fd: bool = False, noise: float = 0.02,
-                 **rates: float) -> FrameBlock:
+                 **rates: Any) -> FrameBlock:
     """What a drive at 1000 rpm with load pulses sends, an injection in the middle included."""
     simulation = DriveSimulation(M2, DriveParameters(sample_rate=RATE, current_noise=noise),
                                  profile.torque_pulses(), seed=node)

@@ -199,6 +199,14 @@ def test_axis_follows_the_estimate() -> None:
     assert command is not None and (command.waveform, command.axis_angle) == (Waveform.PULSATING, -2.0)
 
 
+@pytest.mark.parametrize("axis", [0.0, 0.5])
+def test_an_axis_of_the_stationary_frame_stays_where_it_is(axis: float) -> None:
+    s = Stand(replace(SETTINGS, waveform=Waveform.PULSATING, axis=axis))
+    for s.theta in (-2.0, 3.0):
+        command = s.go()
+        assert command is not None and command.axis_angle == axis
+
+
 @given(st.lists(st.tuples(st.floats(-1000, 1000), st.floats(0, 10), st.floats(0, 100), st.booleans(),
                           st.sampled_from([True, False, None])), max_size=60))
 def test_whatever_comes_the_amplitude_stays_in_bounds(

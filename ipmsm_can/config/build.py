@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from ipmsm_can.config.model import DriveConfig
@@ -29,7 +30,7 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
     o = config.observer
     return EstimatorSettings(o.kind, o.alpha, config.gamma, o.initial_flux, config.epsilon, o.excitation_window,
                              o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
-                             config.estimate.valid_sigma)
+                             config.estimate.valid_sigma, config.injection.frequency)
 
 
 def injection_settings(config: DriveConfig) -> InjectionSettings:
@@ -37,7 +38,8 @@ def injection_settings(config: DriveConfig) -> InjectionSettings:
     i = config.injection
     return InjectionSettings(i.enabled, Waveform[i.waveform.upper()], i.amplitude, i.frequency, i.speed_on,
                              i.speed_off, i.excitation_on, i.excitation_off, i.ramp, config.current_limit,
-                             i.time_to_live, i.period)
+                             i.time_to_live, i.period,
+                             None if i.axis is None else math.radians(i.axis))
 
 
 def drive_parameters(config: DriveConfig, fd: bool = False) -> DriveParameters:
@@ -55,4 +57,4 @@ def drive_parameters(config: DriveConfig, fd: bool = False) -> DriveParameters:
 def drive_node_settings(config: DriveConfig, fd: bool = False) -> DriveNodeSettings:
     """What the simulated drive sends; fd as for `drive_parameters`."""
     s = config.simulation
-    return DriveNodeSettings(s.fd or fd, s.timing_rate, s.status_rate, s.reference_rate)
+    return DriveNodeSettings(s.fd or fd, s.timing_rate, s.status_rate, s.reference_rate, s.encoder_counts)

@@ -17,9 +17,11 @@ from ipmsm_can.config import units
 from ipmsm_can.config.keys import Choice, FilePath, Quantity, Switch
 from ipmsm_can.config.section import KeyProblem, Section
 from ipmsm_can.config.simulation import CLASSICAL_RATE, FD_RATE, SimulationConfig
+from ipmsm_can.estimation.observers.kinds import WINDOW_CAPACITY
 from ipmsm_can.motor import PRESETS, Motor
 
-ObserverKind = Literal["ges"]
+ObserverKind = Literal["ges", "spmsm_gradient", "spmsm_gradient_max", "spmsm_regression", "active_flux_regression",
+                       "chonam", "injection_extraction", "injection_demodulation"]
 OBSERVER_KINDS: tuple[str, ...] = get_args(ObserverKind)
 """The observers a configuration may ask for; the one list of them."""
 
@@ -124,15 +126,20 @@ class ObserverConfig(Section):
     """The position observer and what it may assume about the samples."""
 
     kind: Annotated[ObserverKind, Choice(
-        doc="Observer; ges is the one of the paper's Proposition 1.", choices=OBSERVER_KINDS)] = "ges"
+        doc="Observer; ges is the one of the paper's Proposition 1. The spmsm kinds are for motors with L_d = L_q; "
+            "the injection kinds need a salient motor that injects at injection.frequency, find the angle modulo "
+            "half a turn, and never call it valid.", choices=OBSERVER_KINDS)] = "ges"
     alpha: Annotated[float, Quantity(
-        doc="Bandwidth of the regression's filters (the paper's alpha).",
+        doc="Bandwidth of the regression's filters (the paper's alpha). In the spmsm_gradient and injection kinds "
+            "the angle does not depend on it.",
         unit=units.PER_SECOND, least=1e-3, most=1e5)] = 10.0
     gamma: Annotated[float | None, Quantity(
-        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly.",
+        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly. "
+            "The spmsm_gradient kinds count it in 1/(Wb^2 s); the injection kinds have none.",
         unit=units.GRADIENT_GAIN, above=0,
         default=f"{ROTATING_CONVERGENCE:g} 1/s / (2 alpha psi_m)^2, which converges at "
-                f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed", example=0.5)] = None
+                f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed; "
+                f"{0.5 * ROTATING_CONVERGENCE:g} 1/s / psi_m^2 for the spmsm_gradient kinds", example=0.5)] = None
     initial_flux: Annotated[tuple[float, float], Quantity(
         doc="Stator flux linkage (alpha, beta) the observer starts from; with the default it starts from no "
             "assumed angle.", unit=units.WEBER, count=2)] = (0.0, 0.0)
@@ -204,6 +211,10 @@ class InjectionConfig(Section):
     period: Annotated[float, Quantity(
         doc="Time between repeated commands; below half of time_to_live, so that one may get lost.",
         unit=units.SECOND, above=0)] = 0.02
+    axis: Annotated[float | None, Quantity(
+        doc="Fixed axis of the waveform in the stationary frame (electrical): pulsating at 0 probes v_alpha only; "
+            "rotating starts there, and its phase then does not follow the rotor.",
+        unit=units.DEGREE, least=-180, most=180, default="along the estimated d-axis", example="0 deg")] = None
 
     @model_validator(mode="after")
     def _consistent(self) -> InjectionConfig:
@@ -268,6 +279,13 @@ class DriveConfig(BaseModel):
         if self.epsilon >= psi_m:
             raise KeyProblem("observer.epsilon", f"a flux below the motor's psi_m, {psi_m:g} Wb")
         rate = self.wire.sample_rate
+        if rate is not None and self.observer.kind.startswith("injection_"):
+            # A window of whole periods, of samples that are faster than two a period.
+            low = rate / WINDOW_CAPACITY if self.observer.kind == "injection_extraction" else 0.0
+            if not low <= self.injection.frequency < rate / 2:
+                raise KeyProblem(
+                    "injection.frequency", f"a frequency from {low:g} Hz to below half of the sample rate of "
+                    f"{rate:g} Hz, for observer.kind {self.observer.kind}")
         if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
             raise KeyProblem(
                 "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")
@@ -291,9 +309,14 @@ class DriveConfig(BaseModel):
 
     @property
     def gamma(self) -> float:
-        """Observer gain [1/(V^2 s)]: the given one, or 70 1/s over (2 alpha psi_m)^2."""
+        """Observer gain: the given one, or 70 1/s over (2 alpha psi_m)^2 [1/(V^2 s)].
+
+        For the gradients on the flux's length, which converge at 2 gamma psi_m^2, 35 1/s over psi_m^2 [1/(Wb^2 s)].
+        """
         if self.observer.gamma is not None:
             return self.observer.gamma
+        if self.observer.kind.startswith("spmsm_gradient"):
+            return float(0.5 * ROTATING_CONVERGENCE / self.motor.build().psi_m ** 2)
         return float(ROTATING_CONVERGENCE / (2.0 * self.observer.alpha * self.motor.build().psi_m) ** 2)
 
     @property

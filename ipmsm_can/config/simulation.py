@@ -80,6 +80,9 @@ class SimulationConfig(Section):
     reference_rate: Annotated[float, Quantity(
         doc="DriveReference messages (angle and speed of an encoder) per second; 0 = the drive has none.",
         unit=units.HERTZ, least=0, most=20e3)] = DriveNodeSettings.reference_rate
+    encoder_counts: Annotated[int, Quantity(
+        doc="Angles the encoder tells apart in one turn of the shaft; 0 = as fine as the message.",
+        whole=True, least=0, most=1e9)] = DriveNodeSettings.encoder_counts
 
     @model_validator(mode="after")
     def _consistent(self) -> SimulationConfig:

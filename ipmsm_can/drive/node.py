@@ -16,6 +16,7 @@ from ipmsm_can.wire.protocol import (
     BLOCK_SAMPLES,
     NODES,
     PROTOCOL_VERSION,
+    TWO_PI,
     DriveMode,
     MessageKind,
     Protocol,
@@ -151,6 +152,10 @@ class DriveNode:
 
     def _reference(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         due = self._due(s, self.settings.reference_rate)
+        theta_e = s.theta_e[due]
+        if self.settings.encoder_counts:
+            step = TWO_PI * self.simulation.motor.pole_pairs / self.settings.encoder_counts
+            theta_e = step * np.round(theta_e / step)
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_REFERENCE, self.node, {
-            "theta_e": self._protocol.angle(MessageKind.DRIVE_REFERENCE, "theta_e", s.theta_e[due]),
+            "theta_e": self._protocol.angle(MessageKind.DRIVE_REFERENCE, "theta_e", theta_e),
             "omega_e": s.omega_e[due], "sample_counter": s.sample[due] & 0xFFFFFFFF})

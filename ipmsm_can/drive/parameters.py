@@ -102,12 +102,16 @@ class DriveParameters:
 
 @dataclass(frozen=True)
 class DriveNodeSettings:
-    """What the drive sends: CAN FD blocks instead of single samples, and how often the rest [Hz, 0 = never]."""
+    """What the drive sends: CAN FD blocks instead of single samples, and how often the rest [Hz, 0 = never].
+
+    encoder_counts: angles the encoder tells apart in one turn of the shaft, 0 for no steps.
+    """
 
     fd: bool = False
     timing_rate: float = 50.0
     status_rate: float = 10.0
     reference_rate: float = 500.0
+    encoder_counts: int = 0
 
 
 def _within(name: str, value: float, low: float, high: float, unit: str) -> None:

@@ -16,6 +16,21 @@ currents, whatever is injected: there y = Phi^T x + d is zero.  Only rotation te
 polarity counts as known once the observer has contracted by exp(-POLARITY_CONTRACTION) during time in which y
 stood clear of anything that d or the voltage error can make of it; the slower pole of the rotating error
 dynamics, s^2 + k s + w^2 with k = g |Phi|^2 / T_s, is the rate.
+
+That is the theory of `ges`; of the other observers it describes
+
+    spmsm_gradient(_max)  the linearised error, with the regressor 2 alpha psi_m x_hat/|x_hat| and no filter for
+                          the voltage error to pass.  What turns with the rotor is added, times 1 + k/|w|, which
+                          the slow pole makes of an error in length: the voltage error over |w|, as dead time
+                          causes it, and a salient machine's (L_0/2) |i|.
+                          Held to the circle, spmsm_gradient turns off by phi' = w (cos phi - 1) - (w^2/k) phi: what
+                          pushes it beyond phi = w/(2k) makes it slip round, so a larger sigma means unknown
+    spmsm_regression      the same linear error; (L_0/2) |i| across the axis is added
+    both regressions      without d: |l| |H[i]|, which bounds it, acts as measurement noise correlated over 1/alpha
+    chonam                the error along Phi; Lambda is taken as |l| |H[i]|/|x_hat| in an unknown direction, so a
+                          correction spreads that much in every direction
+    injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
+                          is added.  They see an axis, not its north: polarity is never known, no angle valid.
 """
 
 from __future__ import annotations
@@ -26,6 +41,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
+from ipmsm_can.estimation.observers import kinds
+from ipmsm_can.estimation.observers.common import assumed_motor, injection_delay
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -41,6 +58,7 @@ _LOCK_BELOW = 4.0
 _LOST_ABOVE = 9.0
 _SIGMA_HYSTERESIS = 1.5
 _POLARITY_SIGMA = math.radians(45.0)
+_UNKNOWN_AXIS = math.pi / 2.0
 
 LOCKED = 1
 POLARITY_KNOWN = 2
@@ -51,15 +69,19 @@ STATE = np.dtype([
     ("process", "f8"), ("voltage", "f8"), ("white", "f8"), ("sigma_limit", "f8"),
     ("p_aa", "f8"), ("p_ab", "f8"), ("p_bb", "f8"),
     ("test", "f8"), ("contraction", "f8"), ("locked", "i8"), ("polarity", "i8"), ("lost", "i8"),
+    # What the kind of observer adds; zeros for ges.
+    ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
+    ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
 ])
 
 
 def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: float, current_noise: float,
-              sigma_limit: float, sample_rate: float) -> NDArray[np.void]:
-    """Record array (1,) of STATE.
+              sigma_limit: float, sample_rate: float, kind: int = kinds.GES,
+              injection_frequency: float = 400.0) -> NDArray[np.void]:
+    """Record array (1,) of STATE for the real motor, whatever an observer of this kind takes it for.
 
     alpha [1/s]; epsilon [Wb]; voltage_uncertainty [V]; current_noise [A rms]; sigma_limit: largest 1-sigma
-    [rad electrical] at which an angle counts as locked; sample_rate [Hz].
+    [rad electrical] at which an angle counts as locked; sample_rate, injection_frequency [Hz].
     """
     state = np.zeros(1, STATE)
     st = state[0]
@@ -72,6 +94,18 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
     st["voltage"] = 2.0 * motor.psi_m * voltage_uncertainty
     st["white"] = (2.0 * alpha * motor.psi_m * motor.L_s * current_noise) ** 2
     st["sigma_limit"] = sigma_limit
+    st["L"] = assumed_motor(kind, motor).L_q
+    st["radial"] = kind in (kinds.SPMSM_GRADIENT, kinds.SPMSM_GRADIENT_MAX)
+    st["slips"] = kind == kinds.SPMSM_GRADIENT
+    if kind in kinds.NON_SALIENT:
+        st["across"] = 0.5 * abs(motor.L_0)
+    if kind in (kinds.SPMSM_REGRESSION, kinds.ACTIVE_FLUX_REGRESSION):
+        st["neglected"] = abs(motor.ell)
+    if kind == kinds.CHONAM:
+        st["spread"] = abs(motor.ell)
+    if kind in kinds.MODULO_PI:
+        st["axis_only"] = 1
+        st["delay"] = injection_delay(kind, injection_frequency, sample_rate)
     return state
 
 
@@ -88,6 +122,37 @@ def widen(state: NDArray[np.void], flux_variance: float) -> None:
 
 
 @kernel
+def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
+                flags: NDArray[np.uint8]) -> None:
+    """Judge a block of an observer that puts out an axis and its 1-sigma, in the row of the gain.
+
+    One misfit may be small by chance: its mean square over INNOVATION_TIME counts if it is larger.
+    """
+    st = state[0]
+    smoothing = 1.0 - math.exp(-st.T_s / INNOVATION_TIME)
+    locked = st.locked
+    test = st.test if st.started else _UNKNOWN_AXIS**2
+    st.started = 1
+    for k in range(flux.shape[1]):
+        s = flux[5, k]
+        if s < math.pi:
+            late = st.delay * speed[2, k]
+            s2 = s * s + late * late
+            test += smoothing * (min(s2, _UNKNOWN_AXIS**2) - test)
+            s = math.sqrt(max(s2, test))
+        else:
+            test += smoothing * (_UNKNOWN_AXIS**2 - test)
+            s = math.pi
+        if not s < math.pi:
+            s = math.pi
+        locked = 1 if s < (_SIGMA_HYSTERESIS if locked else 1.0) * st.sigma_limit else 0
+        sigma[k] = s
+        flags[k] = LOCKED * locked
+    st.test = test
+    st.locked = locked
+
+
+@kernel
 def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
                      flags: NDArray[np.uint8]) -> None:
     """Judge a block.
@@ -97,6 +162,9 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
     flags: uint8 (N,), bits LOCKED, POLARITY_KNOWN, VALID.
     """
     st = state[0]
+    if st.axis_only:
+        _axis_block(flux, speed, state, sigma, flags)
+        return
     T_s = st.T_s
     alpha = st.alpha
     psi_m = st.psi_m
@@ -125,23 +193,37 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
             p_ab = 0.0
         phi_a = regression[1, k]
         phi_b = regression[2, k]
+        innovation = flux[4, k]
+        gain = flux[5, k]
+        if st.radial:
+            size = math.sqrt(phi_a * phi_a + phi_b * phi_b)
+            to_radial = 2.0 * alpha * psi_m
+            innovation = innovation / size * to_radial if size > 0.0 else 0.0
+            to_radial = to_radial / math.sqrt(x2) if x2 > st.epsilon * st.epsilon else 0.0
+            phi_a = to_radial * x_a
+            phi_b = to_radial * x_b
         phi2 = phi_a * phi_a + phi_b * phi_b
+        h = math.sqrt(regression[5, k] ** 2 + regression[6, k] ** 2)
         omega = speed[2, k]
         voltage2 = st.voltage * st.voltage * (alpha * alpha / (alpha * alpha + omega * omega))
-        gain = flux[5, k]
+        filtered2 = 0.0 if st.radial else voltage2
+        neglected2 = (st.neglected * h) ** 2
         # Predict, test the innovation against its own variance, correct.
         p_aa += process
         p_bb += process
         b_a = p_aa * phi_a + p_ab * phi_b
         b_b = p_ab * phi_a + p_bb * phi_b
         seen = b_a * phi_a + b_b * phi_b
-        expected = seen + st.white + voltage2 + model2 * phi2
-        innovation = flux[4, k]
+        expected = seen + st.white + filtered2 + model2 * phi2 + neglected2
         test += smoothing * (innovation * innovation / max(expected, 1e-30) - test)
-        spread = gain * gain * (seen + st.white + voltage2 * correlated)
+        spread = gain * gain * (seen + st.white + filtered2 * correlated + neglected2 * (2.0 / (alpha * T_s)))
         p_aa += -2.0 * gain * phi_a * b_a + spread * phi_a * phi_a
         p_bb += -2.0 * gain * phi_b * b_b + spread * phi_b * phi_b
         p_ab += -gain * (phi_a * b_b + phi_b * b_a) + spread * phi_a * phi_b
+        if st.spread > 0.0 and x2 > st.epsilon * st.epsilon:
+            everywhere = spread * (st.spread * h) ** 2 / x2
+            p_aa += everywhere
+            p_bb += everywhere
         ceiling = 4.0 * psi_m * psi_m + x2
         if p_aa > ceiling or p_bb > ceiling:
             # Nothing is known of this direction; without a ceiling P would grow for ever at standstill.
@@ -163,12 +245,22 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
         if x2 > st.epsilon * st.epsilon:
             across = (x_b * x_b * p_aa - 2.0 * x_a * x_b * p_ab + x_a * x_a * p_bb) / x2
             s = math.sqrt(max(across, 0.0) / x2)
+            if st.across > 0.0 or st.radial:
+                i2 = ((flux[0, k] - x_a) ** 2 + (flux[1, k] - x_b) ** 2) / (st.L * st.L)
+                bias2 = st.across * st.across * i2
+                if st.radial:
+                    if gain > 0.0:
+                        st.rate = gain * phi2 / T_s
+                    turning = max(abs(omega), 1e-9)
+                    bias2 = (bias2 + (st.voltage / (2.0 * psi_m * turning)) ** 2) * (1.0 + st.rate / turning) ** 2
+                s = math.sqrt(s * s + bias2 / x2)
+            if st.slips and 2.0 * st.rate * s > abs(omega):
+                s = math.pi
         else:
             s = math.pi
         if not s < math.pi:  # as well where an absurd sample made it NaN
             s = math.pi
         # Polarity: contraction gathered while y cannot be explained by standstill.
-        h = math.sqrt(regression[5, k] ** 2 + regression[6, k] ** 2)
         if regression[0, k] > 4.0 * st.ell * h + 2.0 * math.sqrt(voltage2):
             rate = gain * phi2 / T_s
             if rate > 0.0:

@@ -13,8 +13,9 @@ from ipmsm_can._jit import kernel
 from ipmsm_can.estimation import confidence, excitation, regression, speed
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
-from ipmsm_can.estimation.observers import ges
-from ipmsm_can.estimation.observers.ges import ges_block
+from ipmsm_can.estimation.observers import common
+from ipmsm_can.estimation.observers.dispatch import observer_block
+from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.estimation.regression import regression_block
 from ipmsm_can.estimation.speed import speed_block
 from ipmsm_can.motor import Motor
@@ -32,9 +33,10 @@ _SPEED_DOUBT = 0.1
 class EstimatorSettings:
     """What the estimator needs to know besides the motor; the defaults live in the configuration model.
 
-    kind: name of the observer.  alpha [1/s], gamma [1/(V^2 s)], initial_flux [Wb, Wb], epsilon [Wb];
+    kind: name of the observer, a key of `observers.kinds.KINDS`.  alpha [1/s], gamma in the unit of the
+    observer's own equation, initial_flux [Wb, Wb], epsilon [Wb];
     excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
-    valid_sigma: largest 1-sigma of a valid angle [deg electrical].
+    valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
     """
 
     kind: str
@@ -47,6 +49,7 @@ class EstimatorSettings:
     voltage_uncertainty: float
     current_noise: float
     valid_sigma: float
+    injection_frequency: float = 400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ class EstimateBlock:
     @classmethod
     def empty(cls, n: int) -> EstimateBlock:
         """Room for n samples."""
-        return cls(np.empty((regression.ROWS, n)), np.empty((ges.ROWS, n)), np.empty((speed.ROWS, n)),
+        return cls(np.empty((regression.ROWS, n)), np.empty((common.ROWS, n)), np.empty((speed.ROWS, n)),
                    np.empty(n), np.empty(n), np.empty(n, np.uint8))
 
 
@@ -82,7 +85,7 @@ def estimate_block(samples: Floats, regression_parameters: Records, regression_s
                    angle: Floats, excited: Floats, sigma: Floats, flags: NDArray[np.uint8]) -> None:
     """The five steps over a block in one call: on a live bus the calls cost more than the work."""
     regression_block(samples, regression_parameters, regression_state, regressed)
-    ges_block(samples, regressed, observer_parameters, observer_state, flux)
+    observer_block(samples, regressed, observer_parameters, observer_state, flux)
     speed_block(flux, speed_state, angle)
     excitation_block(regressed, excitation_state, excited)
     confidence_block(regressed, flux, angle, confidence_state, sigma, flags)
@@ -99,16 +102,22 @@ class Estimator:
         self.sample_rate = sample_rate
         self.settings = settings
         s = settings
-        self._regression_parameters = regression.parameters(motor, s.alpha, sample_rate)
+        kind = KINDS[s.kind]
+        self._assumed = common.assumed_motor(kind, motor)
+        self._regression_parameters = regression.parameters(self._assumed, s.alpha, sample_rate)
         self._regression = np.zeros(1, regression.STATE)
-        self._observer_parameters = ges.parameters(motor, s.alpha, s.gamma, s.epsilon, sample_rate)
-        self._observer = np.zeros(1, ges.STATE)
-        self._observer["lambda_a"], self._observer["lambda_b"] = s.initial_flux
+        self._observer_parameters = common.parameters(kind, self._assumed, s.alpha, s.gamma, s.epsilon, sample_rate,
+                                                      s.injection_frequency, s.current_noise)
+        self._observer = self._from_the_start()
         self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, sample_rate)
         self._excitation = excitation.new_state(s.excitation_window, sample_rate)
         self._confidence = confidence.new_state(
             motor, s.alpha, s.epsilon, s.voltage_uncertainty, s.current_noise,
-            math.radians(s.valid_sigma), sample_rate)
+            math.radians(s.valid_sigma), sample_rate, kind, s.injection_frequency)
+
+    def _from_the_start(self) -> Records:
+        a, b = self.settings.initial_flux
+        return common.new_state(a, b, math.atan2(b, a))
 
     @property
     def records(self) -> tuple[Records, ...]:
@@ -163,12 +172,11 @@ class Estimator:
         elapsed = (max(missing, 0) + 1) / self.sample_rate
         self._regression[:] = np.zeros(1, regression.STATE)
         old = self._observer[0]
-        fresh = np.zeros(1, ges.STATE)
         if elapsed > FORGET_AFTER or not self._speed["started"][0]:
             self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, self.sample_rate)
             self._excitation = excitation.new_state(s.excitation_window, self.sample_rate)
             confidence.forget(self._confidence)
-            fresh["lambda_a"], fresh["lambda_b"] = s.initial_flux
+            fresh = self._from_the_start()
         else:
             # The rotor went on turning: carry |x_hat| at the angle it must have now.
             pll = self._speed
@@ -178,8 +186,9 @@ class Estimator:
             held = float(np.hypot(old["x_a"], old["x_b"]))
             if held > s.epsilon:
                 size = held
-            fresh["lambda_a"] = size * math.cos(angle) + self.motor.L_q * first[0]
-            fresh["lambda_b"] = size * math.sin(angle) + self.motor.L_q * first[1]
+            fresh = common.new_state(size * math.cos(angle) + self._assumed.L_q * float(first[0]),
+                                     size * math.sin(angle) + self._assumed.L_q * float(first[1]), angle)
+            fresh["known"] = old["known"]
             one_step_back = angle - float(pll["omega"][0]) / self.sample_rate
             pll["theta"] = pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
             if missing < 0:

@@ -23,7 +23,8 @@ class InjectionSettings:
     """Settings of the scheduler; the defaults live in the configuration model.
 
     waveform; amplitude [V peak]; frequency [Hz]; speed_on, speed_off [rad/s electrical]; excitation_on,
-    excitation_off [V^2 s], both 0 = not used; ramp [V/s]; current_limit [A peak]; time_to_live, period [s].
+    excitation_off [V^2 s], both 0 = not used; ramp [V/s]; current_limit [A peak]; time_to_live, period [s];
+    axis: fixed angle [rad electrical] in the stationary frame, None: along the estimated d-axis.
     """
 
     enabled: bool
@@ -38,6 +39,7 @@ class InjectionSettings:
     current_limit: float
     time_to_live: float
     period: float
+    axis: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +121,8 @@ class InjectionScheduler:
         self._follow(before, target, reason)
         if self.amplitude > 0.0:
             self._off_left = OFF_REPEATS
-            return Command(s.waveform, self.amplitude, s.frequency, theta, s.time_to_live)
+            axis = theta if s.axis is None else s.axis
+            return Command(s.waveform, self.amplitude, s.frequency, axis, s.time_to_live)
         if self._off_left > 0:
             self._off_left -= 1
             return Command(Waveform.OFF, 0.0, s.frequency, 0.0, s.time_to_live)

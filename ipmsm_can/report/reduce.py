@@ -10,15 +10,16 @@ _FEW = 8
 """Points a column that need no reduction."""
 
 
-def envelope(x: Floats, y: Floats, begin: float, end: float, columns: int) -> tuple[Floats, Floats]:
+def envelope(x: Floats, y: Floats, begin: float, end: float, columns: int,
+             few: int = _FEW) -> tuple[Floats, Floats]:
     """x and y cut to begin..end and reduced to at most two points a column, extremes kept.
 
     x rises; NaN in y is a break: a column whose values are all NaN gives one NaN.  Series with at most
-    eight points a column come back as they are.
+    `few` points a column come back as they are.
     """
     inside = slice(int(np.searchsorted(x, begin)), int(np.searchsorted(x, end, side="right")))
     x, y = x[inside], y[inside]
-    if x.size <= _FEW * columns:
+    if x.size <= few * columns:
         return x, y
     column = np.minimum(((x - begin) * (columns / (end - begin))).astype(np.int64), columns - 1)
     starts = np.flatnonzero(np.diff(column, prepend=-1))

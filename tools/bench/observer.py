@@ -17,11 +17,12 @@ from ipmsm_can.drive import profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import regression
 from ipmsm_can.estimation.filters import filter_coefficients
-from ipmsm_can.estimation.observers import ges
+from ipmsm_can.estimation.observers import common, ges, kinds
+from ipmsm_can.estimation.observers.dispatch import observer_block
 from ipmsm_can.motor import M2
 
 Floats = NDArray[np.float64]
-RATE, ALPHA, GAMMA, EPSILON = 5000.0, 10.0, 0.5, 0.059
+RATE, ALPHA, GAMMA, EPSILON, PROBING = 5000.0, 10.0, 0.5, 0.059, 400.0
 
 
 def samples(n: int) -> Floats:
@@ -30,16 +31,42 @@ def samples(n: int) -> Floats:
     return np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
 
 
+def probed_samples(n: int) -> Floats:
+    """float64 (4, n) of a drive at 20 rpm that injects 6 V, rotating: every kind has something to do."""
+    parameters = DriveParameters(sample_rate=RATE, current_noise=0.02)
+    drive = DriveSimulation(M2, parameters, profile.constant(20 * profile.RPM))
+    drive.command_injection(1, 6.0, PROBING, 0.0, n)
+    s = drive.run(n)
+    return np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+
+
 def compiled(block: Floats) -> Callable[[], Floats]:
     """Our kernels on the block."""
     rp = regression.parameters(M2, ALPHA, RATE)
-    op = ges.parameters(M2, ALPHA, GAMMA, EPSILON, RATE)
+    op = common.parameters(kinds.GES, M2, ALPHA, GAMMA, EPSILON, RATE)
     n = block.shape[1]
-    regressed, out = np.empty((regression.ROWS, n)), np.empty((ges.ROWS, n))
+    regressed, out = np.empty((regression.ROWS, n)), np.empty((common.ROWS, n))
 
     def run() -> Floats:
         regression.regression_block(block, rp, np.zeros(1, regression.STATE), regressed)
-        ges.ges_block(block, regressed, op, np.zeros(1, ges.STATE), out)
+        ges.ges_block(block, regressed, op, np.zeros(1, common.STATE), out)
+        return out
+
+    return run
+
+
+def of_kind(name: str, block: Floats) -> Callable[[], Floats]:
+    """Regression and observer of that kind on the block, chosen as on the bus."""
+    kind = kinds.KINDS[name]
+    motor = common.assumed_motor(kind, M2)
+    rp = regression.parameters(motor, ALPHA, RATE)
+    op = common.parameters(kind, motor, ALPHA, GAMMA, EPSILON, RATE, PROBING)
+    n = block.shape[1]
+    regressed, out = np.empty((regression.ROWS, n)), np.empty((common.ROWS, n))
+
+    def run() -> Floats:
+        regression.regression_block(block, rp, np.zeros(1, regression.STATE), regressed)
+        observer_block(block, regressed, op, np.zeros(1, common.STATE), out)
         return out
 
     return run
@@ -48,9 +75,9 @@ def compiled(block: Floats) -> Callable[[], Floats]:
 def single_calls(block: Floats, n: int) -> Callable[[], None]:
     """Our kernels, one sample a call."""
     rp = regression.parameters(M2, ALPHA, RATE)
-    op = ges.parameters(M2, ALPHA, GAMMA, EPSILON, RATE)
-    rs, os_ = np.zeros(1, regression.STATE), np.zeros(1, ges.STATE)
-    regressed, out = np.empty((regression.ROWS, 1)), np.empty((ges.ROWS, 1))
+    op = common.parameters(kinds.GES, M2, ALPHA, GAMMA, EPSILON, RATE)
+    rs, os_ = np.zeros(1, regression.STATE), np.zeros(1, common.STATE)
+    regressed, out = np.empty((regression.ROWS, 1)), np.empty((common.ROWS, 1))
     parts = [np.ascontiguousarray(block[:, k:k + 1]) for k in range(n)]
 
     def run() -> None:
@@ -80,7 +107,7 @@ def in_c(block: Floats) -> Callable[[], Floats] | None:
     p = _Parameters(1.0 / RATE, M2.R, M2.L_q, M2.L_0, M2.ell, ALPHA, f.decay, f.previous, f.present, GAMMA,
                     EPSILON)
     n = block.shape[1]
-    out = np.empty((ges.ROWS, n))
+    out = np.empty((common.ROWS, n))
 
     def run() -> Floats:
         state = np.zeros(16)
@@ -95,16 +122,17 @@ def in_c(block: Floats) -> Callable[[], Floats] | None:
 def in_python(block: Floats) -> Callable[[], Floats]:
     """The same functions uncompiled, on Python lists of floats instead of arrays."""
     rp = {k: float(regression.parameters(M2, ALPHA, RATE)[k][0]) for k in regression.PARAMETERS.names or ()}
-    op = {k: float(ges.parameters(M2, ALPHA, GAMMA, EPSILON, RATE)[k][0]) for k in ges.PARAMETERS.names or ()}
+    ours = common.parameters(kinds.GES, M2, ALPHA, GAMMA, EPSILON, RATE)
+    op = {k: float(ours[k][0]) for k in common.PARAMETERS.names or ()}
     rows = [r.tolist() for r in block]
 
     def run() -> Floats:
         from types import SimpleNamespace
 
         regressed = _Table(regression.ROWS, block.shape[1])
-        out = _Table(ges.ROWS, block.shape[1])
+        out = _Table(common.ROWS, block.shape[1])
         given = _Table.of(rows)
-        zero = dict.fromkeys((*(regression.STATE.names or ()), *(ges.STATE.names or ())), 0.0)
+        zero = dict.fromkeys((*(regression.STATE.names or ()), *(common.STATE.names or ())), 0.0)
         _plain(regression.regression_block)(given, [SimpleNamespace(**rp)], [SimpleNamespace(**zero)], regressed)
         _plain(ges.ges_block)(given, regressed, [SimpleNamespace(**op)], [SimpleNamespace(**zero)], out)
         return np.array(out.rows)

@@ -16,6 +16,7 @@ from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive import profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
+from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.wire.dbc import default_dbc_path
@@ -114,6 +115,23 @@ def observers() -> None:
     row("observer step, one sample a call", f"{1e9 * t:.0f} ns", "", f"{t / per_step:.0f} x block")
 
 
+def kinds() -> None:
+    """Regression and observer of every kind, ns per sample in a block; all taken in turns."""
+    n = 100_000
+    block = observer.probed_samples(n)
+    runs = {name: observer.of_kind(name, block) for name in KINDS}
+    taken: dict[str, list[float]] = {name: [] for name in runs}
+    for turn in range(8):
+        for name, run in runs.items():
+            begin = time.perf_counter()
+            run()
+            if turn:
+                taken[name].append(time.perf_counter() - begin)
+    own = {name: statistics.median(t) / n for name, t in taken.items()}
+    for name, t in own.items():
+        row(f"kind {name}, in a block", f"{1e9 * t:.0f} ns", "", f"{t / own['ges']:.2f} x ges", "under 2000 ns")
+
+
 def simulation() -> None:
     """10 s of the simulated drive at 10 kHz, compiled and in plain Python."""
     def drive(n: int) -> Callable[[], object]:
@@ -160,7 +178,7 @@ def start_up() -> None:
 def main() -> None:
     """Print the table."""
     row("what", "ours", "against", "ratio", "target")
-    for part in (decoding, observers, simulation, replaying, start_up):
+    for part in (decoding, observers, kinds, simulation, replaying, start_up):
         part()
 
 

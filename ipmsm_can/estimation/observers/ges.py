@@ -11,6 +11,8 @@ gains and sample rate; this cannot diverge for any gamma.  Each interval gets ha
 Phi of its beginning and half with the Phi of its end (Strang splitting), which makes the whole second
 order in T_s.  The disturbance estimate depends on x_hat itself without delay; in the closing half it is
 evaluated after the correction, by one fixed-point iteration, to keep the pair symmetric.
+
+Needs rotation, or saliency and a probing signal (Assumption 3); gamma [1/(V^2 s)].  Quoted from the paper.
 """
 
 from __future__ import annotations
@@ -21,42 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.filters import filter_coefficients
-from ipmsm_can.motor import Motor
-
-PARAMETERS = np.dtype([
-    ("T_s", "f8"), ("L_q", "f8"), ("ell", "f8"), ("gamma", "f8"), ("epsilon", "f8"),
-    ("alpha", "f8"), ("decay", "f8"), ("previous", "f8"), ("present", "f8"),
-])
-
-STATE = np.dtype([
-    ("started", "i8"),
-    ("lambda_a", "f8"), ("lambda_b", "f8"),
-    ("kick_a", "f8"), ("kick_b", "f8"),
-    ("s", "f8"), ("f_s", "f8"), ("x_a", "f8"), ("x_b", "f8"),
-])
-
-# Rows of the array that an observer puts out.
-LAMBDA_A, LAMBDA_B, X_A, X_B, INNOVATION, GAIN = range(6)
-ROWS = 6
-
-
-def parameters(motor: Motor, alpha: float, gamma: float, epsilon: float,
-               sample_rate: float) -> NDArray[np.void]:
-    """Record array (1,) of PARAMETERS; alpha [1/s], gamma [1/(V^2 s)], epsilon [Wb], sample_rate [Hz]."""
-    f = filter_coefficients(alpha, 1.0 / sample_rate)
-    p = np.zeros(1, PARAMETERS)
-    p[0] = (1.0 / sample_rate, motor.L_q, motor.ell, gamma, epsilon, alpha, f.decay, f.previous, f.present)
-    return p
-
-
-@kernel
-def _along(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) -> float:
-    """i^T sigma(x): the current along the estimated rotor axis [A peak]."""
-    size = math.sqrt(x_a * x_a + x_b * x_b)
-    if size >= epsilon:
-        return (i_a * x_a + i_b * x_b) / size
-    return 0.0
+from ipmsm_can.estimation.observers.common import GAIN as GAIN
+from ipmsm_can.estimation.observers.common import INNOVATION as INNOVATION
+from ipmsm_can.estimation.observers.common import LAMBDA_A as LAMBDA_A
+from ipmsm_can.estimation.observers.common import LAMBDA_B as LAMBDA_B
+from ipmsm_can.estimation.observers.common import ROWS as ROWS
+from ipmsm_can.estimation.observers.common import X_A as X_A
+from ipmsm_can.estimation.observers.common import X_B as X_B
+from ipmsm_can.estimation.observers.common import along
 
 
 @kernel
@@ -66,7 +40,7 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
 
     samples: float64 (4, N) as for the regression; only the currents are read.
     regression: float64 (7, N) from `regression_block`.
-    parameters, state: record arrays (1,); `state.lambda_a/b` holds the initial flux before the first sample.
+    parameters, state: record arrays (1,) of `common`; `lambda_a/b` holds the initial flux before the first sample.
     out: float64 (6, N): lambda_hat [Wb], x_hat [Wb], innovation y - Phi^T x_hat - d_hat before the correction
     [V Wb], and the total correction gain of the interval (1 - exp(-gamma |Phi|^2 T_s)) / |Phi|^2 [1/V^2].
     """
@@ -99,7 +73,7 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
             l_b += kick_b + regression[4, k]
         x_a = l_a - L_q * i_a
         x_b = l_b - L_q * i_b
-        s_new = _along(i_a, i_b, x_a, x_b, epsilon)
+        s_new = along(i_a, i_b, x_a, x_b, epsilon)
         if started:
             f_open = decay * f_s + previous * s
         else:
@@ -117,7 +91,7 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
         open_residual = y - (phi_a * x_a + phi_b * x_b)
         innovation = open_residual + ell_alpha * (s_new - (f_open + present * s_new))
         c = gain * innovation
-        s = _along(i_a, i_b, x_a + c * phi_a, x_b + c * phi_b, epsilon)
+        s = along(i_a, i_b, x_a + c * phi_a, x_b + c * phi_b, epsilon)
         f_s = f_open + present * s
         residual = open_residual + ell_alpha * (s - f_s)
         c = gain * residual

@@ -1,0 +1,128 @@
+"""What all observers share: their kinds, one record of parameters, one record of state, the rows they put out.
+
+Every observer is a kernel `(samples, regression, parameters, state, out)` over a block, so that one compiled
+call can choose among them; each uses the fields it needs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.estimation.filters import filter_coefficients
+from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
+from ipmsm_can.motor import Motor
+
+_MOST_PERIODS = 16
+_FILTER_PERIODS = 2.0
+"""Time constant of each of the demodulation's two low-passes, in periods of the probing signal."""
+
+PARAMETERS = np.dtype([
+    ("kind", "i8"),
+    ("T_s", "f8"), ("L_q", "f8"), ("psi_m", "f8"), ("ell", "f8"), ("gamma", "f8"), ("epsilon", "f8"),
+    ("alpha", "f8"), ("decay", "f8"), ("previous", "f8"), ("present", "f8"),
+    # The inverse inductance L^-1 = mean I - difference exp(2j theta) conj(.), in 1/H; the current noise in A.
+    ("mean", "f8"), ("difference", "f8"), ("noise", "f8"),
+    # Probing signal: rad per sample, half its cotangent, samples in the window, filter coefficients.
+    ("step", "f8"), ("half_cot", "f8"), ("window", "i8"), ("slow", "f8"), ("average", "f8"),
+])
+
+STATE = np.dtype([
+    ("started", "i8"),
+    ("lambda_a", "f8"), ("lambda_b", "f8"),
+    ("kick_a", "f8"), ("kick_b", "f8"),
+    ("s", "f8"), ("f_s", "f8"), ("x_a", "f8"), ("x_b", "f8"),
+    ("u_a", "f8"), ("u_b", "f8"), ("f_u_a", "f8"), ("f_u_b", "f8"),
+    # Injection: last angle [rad], whether it was ever seen, phase of the reference [rad].
+    ("theta", "f8"), ("known", "i8"), ("phase", "f8"), ("count", "i8"), ("slot", "i8"),
+    ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (8,)),
+    ("sums", "c16", (7,)), ("fresh", "c16", (7,)), ("ring", "c16", (WINDOW_CAPACITY, 3)),
+])
+
+# Rows of the array that an observer puts out: estimated stator flux [Wb]; active flux [Wb]; innovation [V Wb],
+# which is |Phi| times the flux innovation [Wb]; and the gain of the correction over the interval [1/V^2].
+# The kinds in MODULO_PI have no correction: their last row is the 1-sigma of the axis [rad], pi = unknown.
+LAMBDA_A, LAMBDA_B, X_A, X_B, INNOVATION, GAIN = range(6)
+ROWS = 6
+
+
+def assumed_motor(kind: int, motor: Motor) -> Motor:
+    """The machine as an observer of this kind takes it: the kinds in NON_SALIENT know L_s only."""
+    return replace(motor, L_d=motor.L_s, L_q=motor.L_s) if kind in NON_SALIENT else motor
+
+
+def window_length(frequency: float, sample_rate: float) -> int:
+    """Samples that hold whole periods of the probing signal; 0 where the window cannot.
+
+    The fewest periods, up to 16, that are a whole number of samples within 0.1 %, else the best there is.
+    frequency, sample_rate in Hz; 0 for a frequency of half the sample rate or more, and for one whose period is
+    longer than WINDOW_CAPACITY samples.
+    """
+    period = sample_rate / frequency
+    if not 2.0 < period <= WINDOW_CAPACITY:
+        return 0
+    best, best_miss = 0, math.inf
+    for periods in range(1, _MOST_PERIODS + 1):
+        n = round(periods * period)
+        miss = abs(n - periods * period) / n
+        if n > WINDOW_CAPACITY:
+            break
+        if miss < best_miss - 1e-12:
+            best, best_miss = n, miss
+        if miss < 1e-3:
+            break
+    return best
+
+
+def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: float, sample_rate: float,
+               injection_frequency: float = 400.0, current_noise: float = 0.02) -> NDArray[np.void]:
+    """Record array (1,) of PARAMETERS for a motor as `assumed_motor` gives it.
+
+    alpha [1/s]; gamma as in the observer's own equation, [1/(V^2 s)], for the gradients on the flux's length
+    [1/(Wb^2 s)]; epsilon [Wb]; sample_rate, injection_frequency [Hz]; current_noise [A rms].
+    """
+    f = filter_coefficients(alpha, 1.0 / sample_rate)
+    p = np.zeros(1, PARAMETERS)
+    product = motor.L_d * motor.L_q
+    step = 2.0 * math.pi * injection_frequency / sample_rate
+    values = {
+        "kind": kind, "T_s": 1.0 / sample_rate, "L_q": motor.L_q, "psi_m": motor.psi_m, "ell": motor.ell,
+        "gamma": gamma, "epsilon": epsilon,
+        "alpha": alpha, "decay": f.decay, "previous": f.previous, "present": f.present,
+        "mean": motor.L_s / product, "difference": 0.5 * motor.L_0 / product, "noise": current_noise,
+        "step": step, "half_cot": 0.5 / math.tan(0.5 * step),
+        "window": window_length(injection_frequency, sample_rate),
+        "slow": -math.expm1(-step / 8.0), "average": -math.expm1(-step / (2.0 * math.pi * _FILTER_PERIODS)),
+    }
+    for name, value in values.items():
+        p[name] = value
+    return p
+
+
+def injection_delay(kind: int, injection_frequency: float, sample_rate: float) -> float:
+    """Age [s] of the angle of a kind in MODULO_PI: half the window, or the low-passes' time constants."""
+    if kind == INJECTION_EXTRACTION:
+        return 0.5 * window_length(injection_frequency, sample_rate) / sample_rate
+    return 2.0 * _FILTER_PERIODS / injection_frequency
+
+
+def new_state(lambda_a: float, lambda_b: float, theta: float) -> NDArray[np.void]:
+    """Record array (1,) of STATE before the first sample: stator flux [Wb] and, for MODULO_PI, angle [rad]."""
+    state = np.zeros(1, STATE)
+    state["lambda_a"] = lambda_a
+    state["lambda_b"] = lambda_b
+    state["theta"] = theta
+    return state
+
+
+@kernel
+def along(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) -> float:
+    """i^T sigma(x): the current along the estimated rotor axis [A peak], 0 where |x| < epsilon."""
+    size = math.sqrt(x_a * x_a + x_b * x_b)
+    if size >= epsilon:
+        return (i_a * x_a + i_b * x_b) / size
+    return 0.0
