@@ -1,7 +1,7 @@
 # Plain entry points; each sets up .venv first (tools/setup), which takes no time when nothing changed.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench lint clean
+.PHONY: help demo test bench lint clean firmware-codec firmware-test
 PYTHON := .venv/bin/python
 
 help:
@@ -9,6 +9,8 @@ help:
 	@echo "make test    set up, then check style and types and run all tests"
 	@echo "make lint    check style and types only"
 	@echo "make bench   measure the hot paths"
+	@echo "make firmware-codec    write the firmware's C codec anew from dbc/ipmsm_can.dbc"
+	@echo "make firmware-test     test the firmware's C library: compilers, sanitizers, coverage, mutants"
 	@echo "make clean   remove everything that was generated, .venv included"
 
 demo:
@@ -35,6 +37,17 @@ bench:
 	@tools/setup test
 	$(PYTHON) -m tools.bench
 
+firmware-codec:
+	@tools/setup test
+	$(PYTHON) -m tools.firmware_codec
+	$(PYTHON) -m tools.firmware_vectors
+
+firmware-test:
+	@tools/setup test
+	$(PYTHON) -m pytest tests/test_firmware_codec.py tests/test_firmware_vectors.py
+	$(MAKE) -C firmware_stub test coverage mutants PYTHON=$(abspath $(PYTHON))
+
 clean:
+	$(MAKE) -s -C firmware_stub clean
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist out *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
