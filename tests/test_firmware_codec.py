@@ -41,7 +41,7 @@ def test_another_scaling_and_limit_reach_the_c(tmp_path: Path) -> None:
     assert main(["--dbc", str(dbc), "--output", str(tmp_path / "out")]) == 0
     source = (tmp_path / "out" / "ipmsm_can.c").read_text("utf-8")
     body = source.split("int16_t ipmsm_can_drive_sample_i_alpha_encode(float value)")[1]
-    assert body.split("}")[0].strip().endswith("return (int16_t)(roundf(value / 0.05f));")
+    assert body.split("}")[0].strip().endswith("return (int16_t)(roundf(value * 20.0f));")
     parameters = (tmp_path / "out" / "ipmsm_can_parameters.h").read_text("utf-8")
     assert "#define IPMSM_CAN_DRIVE_SAMPLE_I_ALPHA_MAX (819.15f)\n" in parameters
 

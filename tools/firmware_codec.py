@@ -1,8 +1,10 @@
 """The C codec of the firmware stub, generated from a DBC: `make firmware-codec`.
 
 cantools writes pack, unpack and scaling for every message (ipmsm_can.h and ipmsm_can.c).  Its text is taken
-as it is but for two things: the date goes, so that the same DBC gives the same bytes; and unsigned signals
-are rounded in single precision, because a microcontroller with a single-precision unit does double in software.
+as it is but for three things: the date goes, so that the same DBC gives the same bytes; unsigned signals are
+rounded in single precision, because a microcontroller with a single-precision unit does double in software; and
+a division by a factor such as 0.001, which single precision cannot hold, becomes the multiplication by 1000 it
+stands for: exact where the division is a code off, and a tenth of its time.
 What cantools leaves out of a DBC stands in ipmsm_can_parameters.h: the physical limits of what the drive
 sends, the end-to-end identifiers and the protocol version.
 """
@@ -46,6 +48,7 @@ static uint32_t cantools_unsigned_from_float(float value)
     return (value < 4294967296.0f) ? (uint32_t)value : UINT32_MAX;
 }
 """
+_DIVISION = re.compile(r"value / ([0-9.e+-]+)f")
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 _PHYSICAL = {MessageKind.DRIVE_SAMPLE: _AXES,
              MessageKind.DRIVE_SAMPLE_BLOCK: tuple(f"{axis}_0" for axis in _AXES),
@@ -88,7 +91,14 @@ def _single_precision(source: str) -> str:
     if "double" in source:
         raise DbcError("cantools' C source uses double where it is asked for float; adapt "
                        "tools/firmware_codec.py to the installed cantools")
-    return source
+    return _DIVISION.sub(_multiplication, source)
+
+
+def _multiplication(found: re.Match[str]) -> str:
+    inverse = 1.0 / float(found[1])
+    whole = round(inverse)
+    is_whole = 1 < whole < 2**24 and abs(inverse - whole) < 1e-9 * whole
+    return f"value * {whole}.0f" if is_whole else found[0]
 
 
 def _check_block(protocol: Protocol) -> None:

@@ -240,7 +240,7 @@ int ipmsm_can_drive_sample_init(struct ipmsm_can_drive_sample_t *msg_p)
 
 int16_t ipmsm_can_drive_sample_i_alpha_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_i_alpha_decode(int16_t value)
@@ -260,7 +260,7 @@ bool ipmsm_can_drive_sample_i_alpha_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_i_beta_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_i_beta_decode(int16_t value)
@@ -280,7 +280,7 @@ bool ipmsm_can_drive_sample_i_beta_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_v_alpha_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_v_alpha_decode(int16_t value)
@@ -300,7 +300,7 @@ bool ipmsm_can_drive_sample_v_alpha_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_v_beta_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_v_beta_decode(int16_t value)
@@ -705,7 +705,7 @@ bool ipmsm_can_drive_sample_block_sample_count_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_0_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_0_decode(int16_t value)
@@ -727,7 +727,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_0_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_0_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_0_decode(int16_t value)
@@ -749,7 +749,7 @@ bool ipmsm_can_drive_sample_block_i_beta_0_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_0_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_0_decode(int16_t value)
@@ -771,7 +771,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_0_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_0_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_0_decode(int16_t value)
@@ -793,7 +793,7 @@ bool ipmsm_can_drive_sample_block_v_beta_0_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_1_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_1_decode(int16_t value)
@@ -815,7 +815,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_1_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_1_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_1_decode(int16_t value)
@@ -837,7 +837,7 @@ bool ipmsm_can_drive_sample_block_i_beta_1_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_1_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_1_decode(int16_t value)
@@ -859,7 +859,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_1_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_1_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_1_decode(int16_t value)
@@ -881,7 +881,7 @@ bool ipmsm_can_drive_sample_block_v_beta_1_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_2_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_2_decode(int16_t value)
@@ -903,7 +903,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_2_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_2_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_2_decode(int16_t value)
@@ -925,7 +925,7 @@ bool ipmsm_can_drive_sample_block_i_beta_2_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_2_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_2_decode(int16_t value)
@@ -947,7 +947,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_2_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_2_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_2_decode(int16_t value)
@@ -969,7 +969,7 @@ bool ipmsm_can_drive_sample_block_v_beta_2_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_3_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_3_decode(int16_t value)
@@ -991,7 +991,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_3_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_3_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_3_decode(int16_t value)
@@ -1013,7 +1013,7 @@ bool ipmsm_can_drive_sample_block_i_beta_3_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_3_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_3_decode(int16_t value)
@@ -1035,7 +1035,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_3_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_3_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_3_decode(int16_t value)
@@ -1057,7 +1057,7 @@ bool ipmsm_can_drive_sample_block_v_beta_3_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_4_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_4_decode(int16_t value)
@@ -1079,7 +1079,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_4_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_4_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_4_decode(int16_t value)
@@ -1101,7 +1101,7 @@ bool ipmsm_can_drive_sample_block_i_beta_4_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_4_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_4_decode(int16_t value)
@@ -1123,7 +1123,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_4_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_4_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_4_decode(int16_t value)
@@ -1145,7 +1145,7 @@ bool ipmsm_can_drive_sample_block_v_beta_4_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_5_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_5_decode(int16_t value)
@@ -1167,7 +1167,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_5_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_5_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_5_decode(int16_t value)
@@ -1189,7 +1189,7 @@ bool ipmsm_can_drive_sample_block_i_beta_5_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_5_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_5_decode(int16_t value)
@@ -1211,7 +1211,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_5_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_5_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_5_decode(int16_t value)
@@ -1233,7 +1233,7 @@ bool ipmsm_can_drive_sample_block_v_beta_5_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_alpha_6_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_alpha_6_decode(int16_t value)
@@ -1255,7 +1255,7 @@ bool ipmsm_can_drive_sample_block_i_alpha_6_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_i_beta_6_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.005f));
+    return (int16_t)(roundf(value * 200.0f));
 }
 
 float ipmsm_can_drive_sample_block_i_beta_6_decode(int16_t value)
@@ -1277,7 +1277,7 @@ bool ipmsm_can_drive_sample_block_i_beta_6_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_alpha_6_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_alpha_6_decode(int16_t value)
@@ -1299,7 +1299,7 @@ bool ipmsm_can_drive_sample_block_v_alpha_6_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_sample_block_v_beta_6_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.025f));
+    return (int16_t)(roundf(value * 40.0f));
 }
 
 float ipmsm_can_drive_sample_block_v_beta_6_decode(int16_t value)
@@ -1396,7 +1396,7 @@ bool ipmsm_can_drive_timing_sample_counter_is_in_phys_range(float value)
 
 uint32_t ipmsm_can_drive_timing_sample_rate_encode(float value)
 {
-    return (uint32_t)(cantools_unsigned_from_float(roundf(value / 0.001f)));
+    return (uint32_t)(cantools_unsigned_from_float(roundf(value * 1000.0f)));
 }
 
 float ipmsm_can_drive_timing_sample_rate_decode(uint32_t value)
@@ -1561,7 +1561,7 @@ bool ipmsm_can_drive_status_faults_is_in_phys_range(float value)
 
 uint16_t ipmsm_can_drive_status_v_dc_encode(float value)
 {
-    return (uint16_t)(cantools_unsigned_from_float(roundf(value / 0.1f)));
+    return (uint16_t)(cantools_unsigned_from_float(roundf(value * 10.0f)));
 }
 
 float ipmsm_can_drive_status_v_dc_decode(uint16_t value)
@@ -1730,7 +1730,7 @@ bool ipmsm_can_drive_reference_theta_e_is_in_phys_range(float value)
 
 int16_t ipmsm_can_drive_reference_omega_e_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.25f));
+    return (int16_t)(roundf(value * 4.0f));
 }
 
 float ipmsm_can_drive_reference_omega_e_decode(int16_t value)
@@ -1911,7 +1911,7 @@ bool ipmsm_can_position_estimate_theta_e_is_in_phys_range(float value)
 
 int16_t ipmsm_can_position_estimate_omega_e_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.25f));
+    return (int16_t)(roundf(value * 4.0f));
 }
 
 float ipmsm_can_position_estimate_omega_e_decode(int16_t value)
@@ -1933,7 +1933,7 @@ bool ipmsm_can_position_estimate_omega_e_is_in_phys_range(float value)
 
 uint8_t ipmsm_can_position_estimate_sigma_theta_encode(float value)
 {
-    return (uint8_t)(cantools_unsigned_from_float(roundf(value / 0.5f)));
+    return (uint8_t)(cantools_unsigned_from_float(roundf(value * 2.0f)));
 }
 
 float ipmsm_can_position_estimate_sigma_theta_decode(uint8_t value)
@@ -2180,7 +2180,7 @@ bool ipmsm_can_injection_command_waveform_is_in_phys_range(float value)
 
 uint16_t ipmsm_can_injection_command_amplitude_encode(float value)
 {
-    return (uint16_t)(cantools_unsigned_from_float(roundf(value / 0.05f)));
+    return (uint16_t)(cantools_unsigned_from_float(roundf(value * 20.0f)));
 }
 
 float ipmsm_can_injection_command_amplitude_decode(uint16_t value)
@@ -2333,7 +2333,7 @@ int ipmsm_can_active_flux_estimate_init(struct ipmsm_can_active_flux_estimate_t 
 
 int16_t ipmsm_can_active_flux_estimate_x_alpha_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.0001f));
+    return (int16_t)(roundf(value * 10000.0f));
 }
 
 float ipmsm_can_active_flux_estimate_x_alpha_decode(int16_t value)
@@ -2355,7 +2355,7 @@ bool ipmsm_can_active_flux_estimate_x_alpha_is_in_phys_range(float value)
 
 int16_t ipmsm_can_active_flux_estimate_x_beta_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.0001f));
+    return (int16_t)(roundf(value * 10000.0f));
 }
 
 float ipmsm_can_active_flux_estimate_x_beta_decode(int16_t value)
@@ -2377,7 +2377,7 @@ bool ipmsm_can_active_flux_estimate_x_beta_is_in_phys_range(float value)
 
 int16_t ipmsm_can_active_flux_estimate_excitation_level_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.01f));
+    return (int16_t)(roundf(value * 100.0f));
 }
 
 float ipmsm_can_active_flux_estimate_excitation_level_decode(int16_t value)
@@ -2399,7 +2399,7 @@ bool ipmsm_can_active_flux_estimate_excitation_level_is_in_phys_range(float valu
 
 int16_t ipmsm_can_active_flux_estimate_innovation_encode(float value)
 {
-    return (int16_t)(roundf(value / 0.0001f));
+    return (int16_t)(roundf(value * 10000.0f));
 }
 
 float ipmsm_can_active_flux_estimate_innovation_decode(int16_t value)

@@ -5,6 +5,7 @@
 #define HALF_TURN (0x80000000u)
 #define QUARTER_TURN (0x40000000)
 #define LOWEST_FREQUENCY (0.001f)   /* [Hz] one unit of the phase's arithmetic */
+#define RAMP_END (0.01f)            /* of a step */
 #define LONGEST_COMMAND (60000.0f) /* [ms] */
 
 void ipmsm_probing_init(struct ipmsm_probing *probing, float sample_rate, float limit, float ramp)
@@ -89,7 +90,8 @@ static void approach(struct ipmsm_probing *probing)
     if (probing->waveform != probing->asked_waveform) {
         /* The present waveform goes down first, with its own frequency and axis. */
         amplitude -= change;
-        if (amplitude <= 0.0f) {
+        /* A ramp of n steps up is down after n steps, too, whatever rounding left of it. */
+        if (amplitude <= RAMP_END * change) {
             amplitude = 0.0f;
             probing->waveform = probing->asked_waveform;
             probing->phase = 0;

@@ -16,8 +16,9 @@ static const uint8_t command_ids[16] = IPMSM_CAN_INJECTION_COMMAND_DATA_IDS;
 bool ipmsm_receiver_init(struct ipmsm_receiver *receiver, uint8_t node, float sample_rate, float sigma_limit,
                          uint32_t time_to_live_us)
 {
-    const float samples = 1e-6f * (float)time_to_live_us * sample_rate;
-    if (node >= IPMSM_CAN_NODES || !(samples >= 1.0f && samples <= (float)SAMPLE_MASK)) {
+    /* The thousandth keeps a whole number of samples whole where the product rounds down. */
+    const float samples = 1e-6f * (float)time_to_live_us * sample_rate + 0.001f;
+    if (node >= IPMSM_CAN_NODES || !(samples >= 1.0f && samples < (float)(SAMPLE_MASK + 1u))) {
         return false;
     }
     *receiver = (struct ipmsm_receiver){
