@@ -3,6 +3,8 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 .PHONY: help demo test bench lint clean firmware-codec firmware-test
 PYTHON := .venv/bin/python
+# Of the firmware's receiver; longer where it runs unattended.
+FUZZ_SECONDS ?= $(if $(filter true,$(CI)),60,5)
 
 help:
 	@echo "make demo    set up, then run a simulated drive and the companion side by side"
@@ -10,7 +12,7 @@ help:
 	@echo "make lint    check style and types only"
 	@echo "make bench   measure the hot paths"
 	@echo "make firmware-codec    write the firmware's C codec anew from dbc/ipmsm_can.dbc"
-	@echo "make firmware-test     test the firmware's C library: compilers, sanitizers, coverage, mutants"
+	@echo "make firmware-test     test the firmware's C library: sanitizers, coverage, mutants, fuzzing"
 	@echo "make clean   remove everything that was generated, .venv included"
 
 demo:
@@ -24,6 +26,7 @@ lint:
 
 test: lint
 	$(PYTHON) -m pytest -m "not vcan"
+	$(MAKE) firmware-test
 	@# Exit code 77 of tools/vcan/run: no CAN interface can be had here.
 	@code=0; \
 	tools/vcan/run env IPMSM_CAN_REQUIRE_VCAN=1 $(PYTHON) -m pytest tests/vcan || code=$$?; \
@@ -44,8 +47,10 @@ firmware-codec:
 
 firmware-test:
 	@tools/setup test
-	$(PYTHON) -m pytest tests/test_firmware_codec.py tests/test_firmware_vectors.py
-	$(MAKE) -C firmware_stub test coverage mutants PYTHON=$(abspath $(PYTHON))
+	$(MAKE) -s -C firmware_stub test coverage mutants PYTHON=$(abspath $(PYTHON))
+	@if command -v clang >/dev/null || [ "$$CI" = true ]; then \
+		$(MAKE) -s -C firmware_stub fuzz SECONDS=$(FUZZ_SECONDS); \
+	else echo "make firmware-test: SKIPPED: fuzzing the receiver needs clang"; fi
 
 clean:
 	$(MAKE) -s -C firmware_stub clean
