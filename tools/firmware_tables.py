@@ -63,8 +63,9 @@ def _probing(scripts: Sequence[Json]) -> str:
             ("uint8_t", "waveform", [str(w) for w in script["waveform"]]),
             *(("float", name, [_float(v) for v in script[name]]) for name in ("amplitude", "v_alpha", "v_beta"))]))
     rows = [f"    {{{s['node']}u, {_float(s['rate'])}, {_float(s['limit'])}, {_float(s['ramp'])}, "
-            f"{s['rejected']}u, {len(s['events'])}u, probing_{n}_event_vectors, {len(s['waveform'])}u, probing_{n}_waveform, "
-            f"probing_{n}_amplitude, probing_{n}_v_alpha, probing_{n}_v_beta}}," for n, s in enumerate(scripts)]
+            f"{s['rejected']}u, {len(s['events'])}u, probing_{n}_event_vectors, {len(s['waveform'])}u, "
+            f"probing_{n}_waveform, probing_{n}_amplitude, probing_{n}_v_alpha, probing_{n}_v_beta}},"
+            for n, s in enumerate(scripts)]
     return ("struct probing_event { uint32_t at; uint32_t id; uint32_t extended; uint32_t length; "
             "uint8_t payload[8]; };\n" + "".join(parts)
             + "static const struct { uint8_t node; float rate, limit, ramp; uint32_t rejected; uint32_t events; "
