@@ -18,20 +18,17 @@ void ipmsm_probing_init(struct ipmsm_probing *probing, float sample_rate, float 
     };
 }
 
-/* 2^32 numerator / denominator for numerator < denominator <= 2^31: bit by bit, because a float would lose
- * the phase over the seconds a command lives, and 64-bit division costs more flash than this. */
+/* 2^32 numerator / denominator, at most half a turn, to a unit or two; denominator up to 2^30.
+ *
+ * A float alone would lose the phase over the seconds a command lives, and a 64-bit division costs a tenth of
+ * the flash: so a quotient in single precision, and another one of what the first leaves over, which is exact. */
 static uint32_t fraction_of_turn(uint32_t numerator, uint32_t denominator)
 {
-    uint32_t quotient = 0;
-    for (int bit = 0; bit < 32; bit++) {
-        numerator <<= 1;
-        quotient <<= 1;
-        if (numerator >= denominator) {
-            numerator -= denominator;
-            quotient |= 1u;
-        }
-    }
-    return quotient;
+    const float divisor = (float)denominator;
+    const uint32_t quotient = (uint32_t)((float)numerator / divisor * 4294967296.0f);
+    const int64_t rest = (int64_t)(((uint64_t)numerator << 32) - (uint64_t)quotient * denominator);
+    const int32_t correction = (int32_t)((float)(int32_t)(rest / 1024) / divisor * 1024.0f);
+    return quotient + (uint32_t)correction;
 }
 
 static void make_tone(struct ipmsm_tone *tone, uint32_t frequency_mhz, uint32_t rate_mhz, float axis_angle)
