@@ -111,6 +111,7 @@ MUTANTS = [
     ("probing", "amplitude = (amplitude < target) ? amplitude : target;", "", "ramp ends at the target"),
     ("probing", "amplitude += change;", "amplitude = target;", "amplitude is ramped"),
     ("probing", "if (amplitude <= RAMP_END * change) {", "if (true) {", "another waveform waits for the ramp"),
+    ("probing", "return quotient + (uint32_t)correction;", "return quotient;", "the phase keeps its frequency"),
     # the drive
     ("drive", "received == IPMSM_RECEIVED_BAD_COMMAND", "false", "refused commands are counted"),
     ("drive", "&& !ipmsm_probing_ask(&drive->probing, &command, now)",
