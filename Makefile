@@ -12,7 +12,7 @@ help:
 	@echo "make lint    check style and types only"
 	@echo "make bench   measure the hot paths"
 	@echo "make firmware-codec    write the firmware's C codec anew from dbc/ipmsm_can.dbc"
-	@echo "make firmware-test     test the firmware's C library: sanitizers, coverage, mutants, fuzzing"
+	@echo "make firmware-test     test the firmware's C library: sanitizers, mutants, fuzzing, Cortex-M4F"
 	@echo "make clean   remove everything that was generated, .venv included"
 
 demo:
@@ -51,6 +51,9 @@ firmware-test:
 	@if command -v clang >/dev/null || [ "$$CI" = true ]; then \
 		$(MAKE) -s -C firmware_stub fuzz SECONDS=$(FUZZ_SECONDS); \
 	else echo "make firmware-test: SKIPPED: fuzzing the receiver needs clang"; fi
+	@if { command -v arm-none-eabi-gcc && command -v qemu-system-arm; } >/dev/null || [ "$$CI" = true ]; then \
+		$(MAKE) -s -C firmware_stub cortex-m4; \
+	else echo "make firmware-test: SKIPPED: the Cortex-M4F needs arm-none-eabi-gcc and qemu-system-arm"; fi
 
 clean:
 	$(MAKE) -s -C firmware_stub clean

@@ -39,4 +39,7 @@ void test_receiver(void);
 void test_probing(void);
 void test_drive(void);
 
+/* On the microcontroller, with WITH_BUDGET defined: what the library costs there. */
+void budget(void);
+
 #endif
