@@ -46,6 +46,7 @@ W_TIME_TO_LIVE = 9  # samples left
 W_SIZE = 10
 
 _TWO_PI = 2.0 * math.pi
+_RAMP_END = 0.01  # of a step
 
 
 @kernel
@@ -91,7 +92,8 @@ def step(
     amplitude = state[W_AMPLITUDE]
     if state[W_WAVEFORM] != state[W_ASKED_WAVEFORM]:
         amplitude -= change
-        if amplitude <= 0.0:
+        # A ramp of n steps up is down after n steps, too, whatever rounding left of it: in any precision.
+        if amplitude <= _RAMP_END * change:
             amplitude = 0.0
             state[W_WAVEFORM] = state[W_ASKED_WAVEFORM]
             state[W_PHASE] = 0.0
