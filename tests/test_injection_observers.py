@@ -128,6 +128,17 @@ def test_fails_at_speed_and_says_so(kind: str, w: float) -> None:
     assert (off[known] < 3.0 * np.degrees(out.sigma[500:][known])).all()
 
 
+def test_one_good_fit_by_chance_does_not_lock() -> None:
+    """100 rpm and injection on alpha: what leaks in misleads by up to 25 deg, and sometimes looks like a good fit."""
+    samples, theta = turning(M2, 31.4, 1.0, injection("alpha", 6.0, PROBING, RATE, 1500), RATE)
+    samples[:2] += np.random.default_rng(0).normal(0.0, 0.02, (2, 1500))
+    out = run("injection_extraction", samples)
+    off = np.abs(axis_error(out.angle[0], theta))[500:]
+    assert off.max() > 15.0
+    assert (np.degrees(out.flux[5, 500:]) < 5.0).any()
+    assert not (out.flags[500:] & confidence.LOCKED).any()
+
+
 @pytest.mark.parametrize("kind", MODULO_PI)
 def test_says_unknown_without_injection_and_without_saliency(kind: str) -> None:
     still, _ = turning(M2, 6.28, 1.0, np.zeros(1500, complex), RATE)
