@@ -50,7 +50,7 @@ path{fill:none;stroke-linejoin:round;stroke-width:1.4}
 .scroll{overflow-x:auto;margin:6px 0 18px}
 table{border-collapse:collapse;font-size:.88rem}
 th,td{text-align:left;vertical-align:top;padding:4px 14px 4px 0;border-top:1px solid var(--grid);font-weight:400}
-thead th{color:var(--muted);border-top:0;vertical-align:bottom}
+tbody th{min-width:9.5em}thead th{color:var(--muted);border-top:0;vertical-align:bottom}
 td.n,th.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 td.best{font-weight:700}td.far{color:var(--muted)}
 details{margin:6px 0}summary{cursor:pointer;color:var(--muted);font-size:.9rem}
