@@ -129,7 +129,7 @@ def test_fails_at_speed_and_says_so(kind: str, w: float) -> None:
 
 
 def test_one_good_fit_by_chance_does_not_lock() -> None:
-    """100 rpm and injection on alpha: what leaks in misleads by up to 25 deg, and sometimes looks like a good fit."""
+    """100 rpm and injection on alpha: what leaks in misleads by 25 deg, and at times looks like a good fit."""
     samples, theta = turning(M2, 31.4, 1.0, injection("alpha", 6.0, PROBING, RATE, 1500), RATE)
     samples[:2] += np.random.default_rng(0).normal(0.0, 0.02, (2, 1500))
     out = run("injection_extraction", samples)

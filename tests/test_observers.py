@@ -183,7 +183,8 @@ def test_what_neglecting_d_costs() -> None:
     samples, theta = moving_d_current(40.0, 20_000)
     worst = {}
     for kind in ("ges", "active_flux_regression", "chonam"):
-        out = Estimator(M2, RATE, settings(kind, M2, voltage_uncertainty=0.005, current_noise=0.001)).process(samples)
+        chosen = settings(kind, M2, voltage_uncertainty=0.005, current_noise=0.001)
+        out = Estimator(M2, RATE, chosen).process(samples)
         worst[kind] = np.abs(degrees_between(out.angle[0], theta)[-5000:])
         assert (worst[kind] < 3.0 * np.degrees(out.sigma[-5000:])).all()
     assert worst["ges"].max() < 0.02
