@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ipmsm_can.bus import lane
+from ipmsm_can.bus import lane, lane_kernel
 from ipmsm_can.bus.cosim import BusFaults, CoSimulation
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import OBSERVER_KINDS, parse_config
@@ -84,5 +84,5 @@ def test_the_compiled_loop_serves_it(kind: str) -> None:
     node = companion.nodes[0]
     assert node.estimator is not None
     lane.warm_up(companion)
-    signatures = lane._lane.signatures  # type: ignore[attr-defined]
+    signatures = lane_kernel.lap.signatures  # type: ignore[attr-defined]
     assert len(signatures) == 1
