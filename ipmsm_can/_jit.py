@@ -5,14 +5,15 @@ nopython mode, without fast-math (so that the same samples give the same bits wh
 partition) and without the GIL, and the machine code is cached on disk.
 
 numba's own cache notices a change of the file a kernel stands in, but not of a file whose kernels it
-calls.  A `git pull` could therefore leave stale machine code behind; so the cache folder carries a
-digest of every source file of the package that holds kernels.
+calls, or whose constants it takes.  A `git pull` could therefore leave stale machine code behind; so the cache
+folder carries a digest of every source file of the package that holds kernels or is imported by one that does.
 """
 
 from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable
@@ -24,18 +25,35 @@ import numba
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).resolve().parent
+_IMPORT = re.compile(rb"^from (ipmsm_can[\w.]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 _CACHES_KEPT = 4
 _UNUSED_S = 30 * 86400.0
 """A cache folder that no process began to use for so long may go; a younger one may still be written to."""
 
 
+def _kernel_sources() -> list[Path]:
+    """Every file of the package with kernels, and what those files import from it: constants are compiled in."""
+    source = {path: path.read_bytes() for path in _PACKAGE.rglob("*.py")}
+    wanted = [path for path, text in source.items() if b"@kernel" in text]
+    found: set[Path] = set()
+    while wanted:
+        path = wanted.pop()
+        if path in found:
+            continue
+        found.add(path)
+        for module, names in _IMPORT.findall(source[path]):
+            folder = _PACKAGE.joinpath(*module.decode().split(".")[1:])
+            files = [folder.with_suffix(".py"),
+                     *(folder / f"{name}.py" for name in re.findall(r"\w+", names.decode()))]
+            wanted += [file for file in files if file in source]
+    return sorted(found)
+
+
 def _kernel_digest() -> str:
     digest = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        source = path.read_bytes()
-        if b"@kernel" in source:
-            digest.update(path.relative_to(_PACKAGE).as_posix().encode())
-            digest.update(source)
+    for path in _kernel_sources():
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 

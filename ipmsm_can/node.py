@@ -211,14 +211,14 @@ class Node:
             due = due_rows(counter, _every(rate, self.config.estimate.rate), oldest)
             if due.size:
                 frames.append(self._position(part, due))
-        return frames + self.flux_answers(tracked)
+        return frames + self._flux_answers(tracked)
 
     def count_due(self, tracked: Sequence[Tracked]) -> int:
         """How many PositionEstimates `answers` would give."""
         return sum(due_rows(t.run.counter, _every(t.run.sample_rate, self.config.estimate.rate),
                             int(OLDEST_ANSWER * t.run.sample_rate)).size for t in tracked)
 
-    def flux_answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
+    def _flux_answers(self, tracked: Sequence[Tracked]) -> list[NDArray[np.uint8]]:
         """ActiveFluxEstimate frames for the samples that are due."""
         frames = []
         for part in tracked:
@@ -296,13 +296,19 @@ class Node:
     def _fresh(self, now_ns: int) -> bool:
         return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS
 
+    def flowing(self, now_ns: int) -> bool:
+        """Whether samples come in and their rate is known."""
+        return self.view.sample_rate > 0.0 and self._fresh(now_ns)
+
     def frames_until_due(self, now_ns: int) -> int:
-        """Sample frames to come up to the next one that gets a PositionEstimate; 0 while samples do not flow."""
-        view = self.view
-        if view.sample_rate <= 0.0 or not self._fresh(now_ns):
+        """Sample frames to come up to the next one that gets a PositionEstimate, or up to the moment at which a
+        command or status is due; 0 while samples do not flow."""
+        if not self.flowing(now_ns):
             return 0
+        view = self.view
         every = _every(view.sample_rate, self.config.estimate.rate)
-        left = every - view.sample % every
+        left_ns = max(0, min(self.quiet_ns(now_ns), self.next_status - now_ns))
+        left = min(every - view.sample % every, int(left_ns * 1e-9 * view.sample_rate) + 1)
         return -(-left // self.samples_per_frame)
 
     def update_state(self, now_ns: int) -> CompanionState:
@@ -350,4 +356,4 @@ def _every(sample_rate: float, rate: float) -> int:
 
 _NO_ROWS = np.zeros(0, np.intp)
 _AT_ONCE = -(1 << 62)
-_LONG_NS = 1 << 62
+_LONG_NS = 1 << 60

@@ -29,3 +29,10 @@ def test_only_caches_unused_for_a_month_are_removed(tmp_path: Path, monkeypatch:
     own = Path(numba.config.CACHE_DIR)
     assert own.parent == tmp_path
     assert sorted(tmp_path.iterdir()) == sorted([*(tmp_path / f"kernels-{k}" for k in range(4)), *more, own])
+
+
+def test_the_digest_covers_what_kernels_take_their_constants_from() -> None:
+    names = {path.relative_to(_jit._PACKAGE).as_posix() for path in _jit._kernel_sources()}
+    assert {"estimation/observers/ges.py", "estimation/observers/kinds.py", "frames.py", "wire/kernels.py",
+            "bus/lane_kernel.py"} <= names
+    assert not {name for name in names if name.startswith("cli/")}

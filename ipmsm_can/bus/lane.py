@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can.bus import lane_kernel as loop
+from ipmsm_can.bus.live import TURNAROUND_EVERY
 from ipmsm_can.bus.socketcan import MessageTable, SocketCanPort
 from ipmsm_can.companion import Companion
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.frames import FrameBlock
-from ipmsm_can.node import OLDEST_ANSWER, Node, Tracked
+from ipmsm_can.node import OLDEST_ANSWER, Tracked
 from ipmsm_can.wire.codec import MessageCodec
 from ipmsm_can.wire.kernels import FLOAT, KIND, PARENT
 from ipmsm_can.wire.protocol import MessageKind
@@ -28,13 +29,12 @@ from ipmsm_can.wire.receive import AXES, PLAUSIBLE
 from ipmsm_can.wire.sequence import SampleRun
 
 LAP_NS = 250_000_000
-"""How long the loop runs before Python sees what happened; shorter while it has probing commands to send."""
+"""How long the loop runs before Python sees what happened; shorter where a probing command is due."""
 CAPACITY = 1 << 15
 """Frames, and samples, that one lap can take in."""
-TIME_EVERY = 8
-"""Of so many answers, one is timed: reading the clock is not free everywhere.  Where it takes more than CHEAP_NS,
-it is also read no more often than that to see whether answers come too late; else for each of them."""
 CHEAP_NS = 1000
+"""Where reading the clock takes longer [ns], only one answer in TURNAROUND_EVERY, and the first of each lap, is
+looked at for coming too late; else each."""
 _TRIALS = 100
 _READ = {
     MessageKind.DRIVE_SAMPLE: ("i_alpha", "i_beta", "v_alpha", "v_beta", "sample_counter"),
@@ -50,7 +50,8 @@ class Lap:
     taken: frames that are dealt with; by_kind: how many of each kind.  tracked: their samples, empty or one.
     left: frames not dealt with.
     sent: answers sent, at the time of what they answer.  unsent: answers that the port would not take.
-    took: some of the turnarounds [s].  late: answers withheld because their samples were read too late.
+    silent: it ended because no frame came in time, or none can.  took: some of the turnarounds [s].
+    late: answers withheld because their samples were read too late.
     """
 
     taken: FrameBlock
@@ -59,6 +60,7 @@ class Lap:
     left: FrameBlock
     sent: FrameBlock
     unsent: FrameBlock
+    silent: bool
     took: NDArray[np.float64]
     late: int
 
@@ -76,6 +78,8 @@ class LanePort(Protocol):
 
     def fileno(self) -> int: ...
 
+    def check(self) -> None: ...
+
 
 class _Nowhere:
     """A port without a socket: every receive fails at once."""
@@ -89,6 +93,9 @@ class _Nowhere:
 
     def fileno(self) -> int:
         return -1
+
+    def check(self) -> None:
+        """It is as it should be."""
 
 
 def warm_up(companion: Companion) -> None:
@@ -146,7 +153,7 @@ class FastLane:
         self._outgoing = loop.Outgoing(out.frames, out.frames.view(np.uint64), out.iov, out.headers.ctypes.data,
                                        moment, moment.ctypes.data)
         cheap = loop.time_clock(self._outgoing, _TRIALS) < _TRIALS * CHEAP_NS
-        self._clock_every = 1 if cheap else TIME_EVERY
+        self._clock_every = 1 if cheap else TURNAROUND_EVERY
         n = CAPACITY
         self._kept = loop.Kept(
             raw=np.zeros((n, 72), np.uint8), t_ns=np.zeros(n, np.int64), counter=np.zeros((2, n), np.int64),
@@ -157,7 +164,8 @@ class FastLane:
     @classmethod
     def over(cls, port: object, companion: Companion) -> FastLane | None:
         """The loop where it can serve: one drive, that is answered, on SocketCAN, with samples it can decode."""
-        if not (isinstance(port, SocketCanPort) and companion.transmit and len(companion.nodes) == 1):
+        if not (isinstance(port, SocketCanPort) and companion.transmit and len(companion.nodes) == 1
+                and len(port.tables[0].headers) >= loop.MOST):
             return None
         codecs = companion.protocol.codecs
         sample = codecs[MessageKind.DRIVE_SAMPLE]
@@ -171,14 +179,21 @@ class FastLane:
     def ready(self, now_ns: int) -> bool:
         """Whether samples flow and nothing but samples is due now."""
         node = self._node
-        return (node.estimator is not None and node.running and node.frames_until_due(now_ns) > 0
-                and node.samples_per_frame == 1 and node.quiet_ns(now_ns) > 0)
+        return (node.estimator is not None and node.running and node.flowing(now_ns)
+                and node.samples_per_frame == 1 and node.quiet_ns(now_ns) > 0 and self._room_for_answers())
+
+    def _room_for_answers(self) -> bool:
+        """Whether the port's table can hold what one batch can call for, every loss in it filled."""
+        node = self._node
+        every = node.samples_per_answer
+        samples = (node.receiver.sequencer.max_gap + 1) * min(every, loop.MOST)
+        most = samples // every + samples // node.samples_per_flux_answer + 3
+        return most <= len(self._outgoing.frames)
 
     def run(self, timeout_s: float, now_ns: int) -> Lap:
         """Serve until there is something for Python to do, at most LAP_NS; waits timeout_s per frame."""
         node, port = self._node, self._port
         estimator = node.estimator
-        assert isinstance(node, Node)
         assert isinstance(estimator, Estimator)
         port.set_timeout(timeout_s)
         result = np.zeros(loop.RESULTS, np.int64)
@@ -187,13 +202,13 @@ class FastLane:
         companion = self._companion
         calm_speed, calm_excitation = node.scheduler.calm
         plan = loop.Plan(
-            lap_ns=min(LAP_NS, node.quiet_ns(now_ns)), max_gap=node.receiver.sequencer.max_gap,
+            lap_ns=LAP_NS, end_ns=now_ns + node.quiet_ns(now_ns), max_gap=node.receiver.sequencer.max_gap,
             every=node.samples_per_answer, flux_every=node.samples_per_flux_answer,
             oldest=int(OLDEST_ANSWER * node.view.sample_rate), injecting=int(node.injecting),
             rejected=node.rejected_commands, step=node.position_step, calm_speed=calm_speed,
             calm_excitation=calm_excitation, status_period=node.status_period,
             status=node.status_values(now_ns, companion.bus_load, companion.turnaround),
-            state_row=self._state_row, time_every=TIME_EVERY, clock_every=self._clock_every,
+            state_row=self._state_row, time_every=TURNAROUND_EVERY, clock_every=self._clock_every,
             oldest_s=OLDEST_ANSWER)
         sequencer = node.receiver.sequencer
         rp, rs, op, os, sp, ex, cf = estimator.records
@@ -209,12 +224,19 @@ class FastLane:
         by_kind = {MessageKind.DRIVE_SAMPLE: samples, MessageKind.DRIVE_TIMING: timings,
                    MessageKind.DRIVE_STATUS: statuses,
                    MessageKind.DRIVE_REFERENCE: taken - samples - timings - statuses}
+        last_ns = kept.t_ns[taken - 1] if taken else now_ns
         return Lap(frames, by_kind, self._tracked(done) if done else [],
                    FrameBlock(incoming.raw[:left].copy(), incoming.t_ns[:left].copy()) if why == loop.STRANGE
                    else _NOTHING,
                    FrameBlock(kept.sent_words[:sent].copy().view(np.uint8), kept.sent_t_ns[:sent].copy()),
-                   FrameBlock(self._outgoing.frames[first:first + unsent].copy(), np.zeros(unsent, np.int64)),
-                   kept.took[:timed].copy(), late)
+                   FrameBlock(self._outgoing.frames[first:first + unsent].copy(),
+                              np.full(unsent, last_ns, np.int64)),
+                   why == loop.SILENCE, kept.took[:timed].copy(), late)
+
+    def check_bus(self) -> None:
+        """Raise BusError where there is nothing to wait for; the loop does not tell silence from an interface that
+        went down."""
+        self._port.check()
 
     def _tracked(self, done: int) -> list[Tracked]:
         node, kept = self._node, self._kept

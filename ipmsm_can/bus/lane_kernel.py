@@ -17,7 +17,7 @@ from ipmsm_can.bus.socketcan import unpack
 from ipmsm_can.estimation import regression, speed
 from ipmsm_can.estimation.confidence import VALID
 from ipmsm_can.estimation.estimator import estimate_block
-from ipmsm_can.estimation.observers import ges
+from ipmsm_can.estimation.observers import common
 from ipmsm_can.injection.meter import meter_block
 from ipmsm_can.wire.answers import due_among, flux_values, position_values, tracking_state
 from ipmsm_can.wire.e2e import crc_p02
@@ -29,7 +29,8 @@ MOST = 64
 """Frames that one receive takes at most."""
 
 DONE, SILENCE, STRANGE, UNSENT = range(4)
-"""Why the loop came back: time to; no frame in time; a batch for the ordinary path; answers not taken."""
+"""Why the loop came back: it was time; no frame in time, or no bus; a batch for the ordinary path; answers that the
+port would not take."""
 
 _recvmmsg = types.ExternalFunction(
     "recvmmsg", types.int32(types.int32, types.intp, types.uint32, types.int32, types.intp))
@@ -44,7 +45,7 @@ Records = NDArray[np.void]
 Words = NDArray[np.uint64]
 
 FLUX_AT = regression.ROWS
-ANGLE_AT = FLUX_AT + ges.ROWS
+ANGLE_AT = FLUX_AT + common.ROWS
 EXCITATION_AT = ANGLE_AT + speed.ROWS
 SIGMA_AT = EXCITATION_AT + 1
 ESTIMATES = SIGMA_AT + 1
@@ -52,6 +53,7 @@ ESTIMATES = SIGMA_AT + 1
 
 _RUNNING, _VERSION = int(DriveMode.RUNNING), PROTOCOL_VERSION
 _CLOCK_REALTIME = 0
+_LONG_NS = 10**12
 
 
 class Decoder(NamedTuple):
@@ -131,16 +133,19 @@ class LaneRecords(NamedTuple):
 class Plan(NamedTuple):
     """What holds for a lap.
 
-    lap_ns: how long at most.  max_gap: longest loss, in samples, that is filled.
+    lap_ns: how long at most; end_ns: when Python has to give the next command [ns].
+    max_gap: longest loss, in samples, that is filled.
     every, flux_every: samples per PositionEstimate and ActiveFluxEstimate; oldest: age in samples beyond which
     none is sent.  injecting, rejected: what DriveStatus said last.  step: resolution of theta_e [rad].
     calm_speed [rad/s electrical], calm_excitation [V^2 s]: below them Python is to be asked at once.
-    status_period [ns]; status (n_signals, 1): CompanionStatus but for its state, in row state_row.
+    status_period [ns]; status (n_signals, 1): CompanionStatus as of the lap's beginning, but for its state, which
+    goes into row state_row.
     time_every: of so many answers, one is timed; clock_every: for so many, the clock is read once to see whether
     they come too late, beyond oldest_s.
     """
 
     lap_ns: int
+    end_ns: int
     max_gap: int
     every: int
     flux_every: int
@@ -230,18 +235,28 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
     words = incoming.words
     t_ns = incoming.t_ns
     capacity = kept.t_ns.shape[0]
+    rows = outgoing.frames.shape[0]
+    most_samples = (plan.max_gap + 1) * MOST
     before = records.sequencer.copy()
     counts_before = records.counts.copy()
     begin = -1
     late = False
+    unchecked = True
     while True:
         taken = result[TAKEN]
         done = result[SAMPLES]
-        want = min(plan.every - st.last % plan.every, MOST)
+        if taken + MOST > capacity or done + most_samples > capacity or result[SENT] + rows > capacity:
+            return DONE
+        # Up to the next sample that is to be answered, or to the next moment at which something else is due.
+        want = min(plan.every - (st.last & 0xFFFFFFFF) % plan.every, MOST)
+        until = min(plan.end_ns, result[NEXT_STATUS]) - st.last_t
+        want = min(want, max(1, int(min(until, _LONG_NS) * 1e-9 * st.rate) + 1))
         n = _recvmmsg(incoming.handle, incoming.address, want, 0, 0)
         if n <= 0:
             return SILENCE
         n = unpack(n, incoming.headers, incoming.control, incoming.frames, raw, t_ns, incoming.state)
+        if n == 0:
+            continue
         strange = not st.has_last or st.rate <= 0.0
         events = 0
         timings = 0
@@ -316,10 +331,9 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
         now = t_ns[n - 1]
         if begin < 0:
             begin = now
-        full = (taken + MOST > capacity or done + (plan.max_gap + 2) * MOST > capacity
-                or result[SENT] + (plan.max_gap + 2) * MOST > capacity or now < begin or now - begin >= plan.lap_ns)
+        over = now < begin or now - begin >= plan.lap_ns or now >= plan.end_ns
         if m == 0:
-            if full:
+            if over:
                 return DONE
             continue
         samples = np.empty((4, m))
@@ -354,14 +368,18 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
             kept.estimates[SIGMA_AT, done + k] = sigma[k]
         result[SAMPLES] = done + m
         due = np.empty(m, np.intp)
+        flux_due = np.empty(m, np.intp)
         counters = run_counter[:m]
         n_due = due_among(counters, plan.every, plan.oldest, due)
+        n_flux = min(due_among(counters, plan.flux_every, plan.oldest, flux_due), rows - n_due - 1)
         answer = run_counter[m - 1] // plan.every
-        if n_due > 0 and (late or answer % plan.clock_every == 0):
+        if n_due + n_flux > 0 and (late or unchecked or answer % plan.clock_every == 0):
             late = _clock(outgoing) - run_t[m - 1] > 1e9 * plan.oldest_s
+            unchecked = False
         if late:
             result[LATE] += n_due
             n_due = 0
+            n_flux = 0
         out = n_due
         if n_due > 0:
             said = np.empty(m, np.uint8)
@@ -374,13 +392,10 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 outgoing.frames[j, 9] = (outgoing.frames[j, 9] & 0xF0) | (result[COUNTER] & 0x0F)
                 outgoing.frames[j, 8] = crc_p02(outgoing.frames, j, 8, wire.data_ids)
                 result[COUNTER] += 1
-        n_flux = due_among(counters, plan.flux_every, plan.oldest, due)
-        if late:
-            n_flux = 0
         if n_flux > 0:
             fluxes = np.empty((wire.flux.table.shape[0], n_flux))
             fluxes[:] = np.nan
-            flux_values(regressed, flux, excited, due[:n_flux], wire.flux.rows, fluxes)
+            flux_values(regressed, flux, excited, flux_due[:n_flux], wire.flux.rows, fluxes)
             _encode(fluxes, wire.flux, outgoing.words[out:])
             out += n_flux
         # The first time, or the clock was set back, or due.
@@ -403,7 +418,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 result[FIRST_UNSENT] = sent
                 return UNSENT
             if n_due > 0 and answer % plan.time_every == 0 and result[TIMED] < kept.took.shape[0]:
-                kept.took[result[TIMED]] = 1e-9 * (_clock(outgoing) - run_t[m - 1])
+                kept.took[result[TIMED]] = 1e-9 * (_clock(outgoing) - run_t[due[n_due - 1]])
                 result[TIMED] += 1
-        if full or abs(angle[speed.OMEGA, m - 1]) < plan.calm_speed or excited[m - 1] < plan.calm_excitation:
+        if over or abs(angle[speed.OMEGA, m - 1]) < plan.calm_speed or excited[m - 1] < plan.calm_excitation:
             return DONE

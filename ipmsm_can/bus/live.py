@@ -2,8 +2,8 @@
 
 Between two answers there is nothing to do but collect samples.  A process that wakes up for every frame pays
 for every frame; so the runner asks the port for as many frames as are missing until the next sample that is
-to be answered, and is woken once, by that one.  A companion that only listens has nothing to be in time for: it
-lets frames gather.
+to be answered, or until a command or status is due, and is woken once, by that one.  A companion that only
+listens has nothing to be in time for: it lets frames gather.
 
 The clock is the frames' own: the time of the newest frame is now.  Only silence is timed by the runner.
 """
@@ -37,7 +37,8 @@ LOAD_EVERY = 32
 """Rounds after which the bus load is worked out."""
 _KEPT = 1 << 16
 _ABSURD_S = 10.0
-"""A frame that seems to have waited longer was stamped by another clock than ours."""
+"""A first frame that seems to have waited longer was stamped by another clock than ours."""
+_NOTHING = FrameBlock.zeros(0)
 
 Observer = Callable[[FrameBlock, Sequence[Tracked], FrameBlock, int], None]
 """Called after each round with what came in, what was estimated, what was sent, and the time [ns]."""
@@ -78,6 +79,8 @@ class LiveRunner:
         self._unweighed: list[FrameBlock] = []
         self._rounds = 0
         self._flowing = False
+        self._own_clock: bool | None = None
+        """Whether the adapter stamps by a clock that is not the computer's."""
         self._lane = self._find_lane()
 
     def _find_lane(self) -> FastLane | None:
@@ -104,35 +107,45 @@ class LiveRunner:
         self.sent += len(lap.sent)
         for took in lap.took.tolist():
             self._note_turnaround(took)
+        companion.count_usual(lap.by_kind)
+        companion.late += lap.late
         unstamped = lap.left.t_ns < 0
         if unstamped.any():
             lap.left.t_ns[unstamped] = time.time_ns()
-        companion.count_usual(lap.by_kind)
         now = self._time(lap.left if len(lap.left) else lap.taken)
         tracked = companion.feed(lap.left)
-        companion.late += lap.late
         answers = FrameBlock.concat([lap.unsent, companion.respond(tracked, now, self._is_late(tracked))])
-        if len(answers):
-            self.sent += self.port.send(answers)
         block = FrameBlock.concat([lap.taken, lap.left])
-        answers = FrameBlock.concat([lap.sent, answers])
-        self._weigh(block, answers, now, at_once=True)
-        if observer is not None:
-            observer(block, [*lap.tracked, *tracked], answers, now)
+        self._send(answers, block, [*lap.tracked, *tracked], now, observer, lap.sent)
+        if lap.silent:
+            lane.check_bus()
 
     def _plain_round(self, observer: Observer | None) -> None:
-        companion = self.companion
         block = self._receive()
         now = self._time(block)
-        tracked = companion.feed(block)
-        answers = companion.respond(tracked, now, self._is_late(tracked))
-        if len(answers):
-            self.sent += self.port.send(answers)
-            if tracked:
-                self._time_answer(int(tracked[-1].run.t_ns[-1]))
-        self._weigh(block, answers, now)
-        if observer is not None:
-            observer(block, tracked, answers, now)
+        tracked = self.companion.feed(block)
+        answers = self.companion.respond(tracked, now, self._is_late(tracked))
+        if self._send(answers, block, tracked, now, observer) and tracked:
+            self._time_answer(int(tracked[-1].run.t_ns[-1]))
+
+    def _send(self, answers: FrameBlock, block: FrameBlock, tracked: Sequence[Tracked], now_ns: int,
+              observer: Observer | None, before: FrameBlock = _NOTHING) -> int:
+        """Send answers, weigh and show the round; returns how many the port took.  It is also shown, and so
+        recorded, where the bus goes away at that moment.
+
+        before: answers of this round that are sent already.
+        """
+        sent = 0
+        try:
+            if len(answers):
+                sent = self.port.send(answers)
+                self.sent += sent
+        finally:
+            gone = FrameBlock.concat([before, answers.take(slice(0, sent))])
+            self._weigh(block, gone, now_ns, at_once=len(before) > 0)
+            if observer is not None:
+                observer(block, tracked, gone, now_ns)
+        return sent
 
     def _receive(self) -> FrameBlock:
         if self.companion.transmit:
@@ -156,7 +169,10 @@ class LiveRunner:
         if not (tracked and self.companion.transmit):
             return False
         waited = 1e-9 * (time.time_ns() - max(int(t.run.t_ns[-1]) for t in tracked))
-        return OLDEST_ANSWER < waited < _ABSURD_S
+        if self._own_clock is None:
+            # Told by the first samples: later ones may be as old because this process was stopped.
+            self._own_clock = not -_ABSURD_S < waited < _ABSURD_S
+        return waited > OLDEST_ANSWER and not self._own_clock
 
     def _time_answer(self, arrived_ns: int) -> None:
         self._answered += 1

@@ -261,6 +261,10 @@ class SocketCanPort:
         if timeout_s != self._timeout_s:
             self._set_timeout(timeout_s)
 
+    def check(self) -> None:
+        """Raise BusError when the interface is gone or down."""
+        self._check_interface()
+
     def fileno(self) -> int:
         """The socket's handle, for select and event loops."""
         return self._handle

@@ -2,7 +2,8 @@
 
 Injection starts at low speed or on poor excitation and ends at speed, with hysteresis; the amplitude ramps up
 and down and is cut back in proportion where the measured high-frequency current exceeds its limit.  The
-scheduler has no clock: it is asked once per command period, with the time of the samples.
+scheduler has no clock: it is asked once per command period, with the time of the samples; while it `rests` it need
+not be asked.
 """
 
 from __future__ import annotations
