@@ -380,7 +380,13 @@ def test_frames_until_due_never_sleeps_over_an_answer() -> None:
     companion.feed(FrameBlock(PROTOCOL.encode(MessageKind.DRIVE_TIMING, 0, {
         "sample_counter": 0.0, "sample_rate": RATE}), np.zeros(1, np.int64)))
     for k in range(500):
-        companion.feed(frames.take(slice(k, k + 1)))
         now = int(frames.t_ns[k])
-        assert companion.frames_until_due(now) == 5 - k % 5
+        tracked = companion.feed(frames.take(slice(k, k + 1)))
+        companion.respond(tracked, now)
+        node = companion.nodes[0]
+        other = min(node.next_status - now, node.quiet_ns(now)) * 1e-9 * RATE
+        frames_left = companion.frames_until_due(now)
+        assert 1 <= frames_left <= min(5 - k % 5, other + 1)
+        if other > 5:
+            assert frames_left == 5 - k % 5
     assert companion.frames_until_due(now + STALE_AFTER_NS + 1) == 1
