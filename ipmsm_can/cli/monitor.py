@@ -119,7 +119,8 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float) -> No
         sample_rate=view.sample_rate, samples_per_s=samples_per_s, estimates_per_s=estimates_per_s,
         received=count("received"), lost=count("lost"), filled=count("filled"), gaps=count("gaps"),
         duplicates=count("duplicates"), reordered=count("reordered"), resyncs=count("resyncs"),
-        restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands)
+        restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands,
+        clipped=count("clipped"), distrusting=node.distrusting)
 
 
 def injection_words(state: InjectionState, reason: InjectionReason, amplitude: float) -> str:

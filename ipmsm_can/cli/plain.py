@@ -39,7 +39,7 @@ def losses(node: NodeStatus) -> list[tuple[str, int]]:
     """What went wrong with the samples, in the order of the display."""
     return [("lost", node.lost), ("filled", node.filled), ("gaps", node.gaps), ("bad frames", node.bad_frames),
             ("duplicates", node.duplicates), ("reordered", node.reordered), ("resyncs", node.resyncs),
-            ("restarts", node.restarts)]
+            ("restarts", node.restarts), ("cut off", node.clipped)]
 
 
 def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:

@@ -227,7 +227,7 @@ def _node_lines(number: int, s: NodeSummary, replay: Replay) -> list[str]:
     lines = [f"node {number}: {s.rows} samples over {s.duration:.3f} s at {s.sample_rate:g} Hz",
              f"  wire       {count('lost')} lost, {count('filled')} of them filled; {count('gaps')} gaps, "
              f"{count('duplicates')} duplicates, {count('reordered')} late, {count('restarts')} restarts, "
-             f"{count('resyncs')} resyncs, {node.bad_frames} bad frames"]
+             f"{count('resyncs')} resyncs, {node.bad_frames} bad frames, {count('clipped')} cut off"]
     if not s.rows:
         return [f"node {number}: no samples", lines[1]]
     lines.append(f"  lock       {_when('first locked', s.first_locked)}, locked {_share(s.locked, s.rows)}; "

@@ -34,6 +34,9 @@ from ipmsm_can._jit import kernel
 
 NIBBLE, TIMING, FULL = range(3)
 """Kinds of event: sample with a 4-bit counter, DriveTiming, sample with a 32-bit counter."""
+CLIPPED = 4
+"""Added to the kind of a sample that was cut off at the end of its range; also the bit in `SampleRun.doubt`."""
+_KIND = 3
 
 RATE_MIN, RATE_MAX = 100.0, 100_000.0
 """Sample rates [Hz] that are believed."""
@@ -67,9 +70,10 @@ STATE = np.dtype([
     ("correction", "i8"), ("doubt", "i8"), ("doubted_t", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
 ])
 
-RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
+(RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW,
+ CLIPPED_SAMPLES) = range(11)
 COUNTERS = ("received", "filled", "lost", "duplicates", "reordered", "gaps", "resyncs", "restarts",
-            "bad_rate", "overflow")
+            "bad_rate", "overflow", "clipped")
 
 SEQUENCED, _RATE_CHANGED = range(2)
 """Why `sequence` stopped: at the end, or for another sample rate."""
@@ -81,8 +85,9 @@ _WRAP = 1 << 32
 class Events:
     """Sample and timing frames of one drive in order of arrival, N events.
 
-    kind (N,) int64: NIBBLE, TIMING or FULL.  counter (N,) int64: 4 or 32 bits.  rate (N,) float64 [Hz], for
-    TIMING.  t_ns (N,) int64 arrival time [ns].  values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
+    kind (N,) int64: NIBBLE, TIMING or FULL; CLIPPED is added to that of a sample which was cut off.
+    counter (N,) int64: 4 or 32 bits.  rate (N,) float64 [Hz], for TIMING.  t_ns (N,) int64 arrival time [ns].
+    values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
     """
 
     kind: Ints
@@ -116,7 +121,8 @@ class SampleRun:
     none, RESTARTED after a restart of the drive; negative where the samples before it turn out to have been
     dated wrong, by so many samples).
     doubt (M,) uint8: 1 while the counter, so the time, may be wrong by whole wraps: after a silence that could be
-    loss or lateness, until DriveTiming or the pace of arrival settles it.
+    loss or lateness, until DriveTiming or the pace of arrival settles it.  CLIPPED is added where the sample, or
+    the one that a filled one leads to, was cut off at the end of its range.
     t_ns (M,) int64: arrival of the frame (filled: of the frame that closed the gap).
     """
 
@@ -268,8 +274,10 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                 return m, k + 1, _RATE_CHANGED
             k += 1
             continue
+        whole = kind[k] & _KIND == FULL
+        clipped = kind[k] & CLIPPED
         if st.has_last:
-            if kind[k] == NIBBLE:
+            if not whole:
                 steps = _steps_since_last(counter[k], t_ns[k], st)
             else:
                 st.doubt = 0
@@ -294,11 +302,11 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.last += steps
             st.seen = (st.seen << np.uint64(steps)) | np.uint64(1) if steps < 64 else np.uint64(1)
             counts[LOST] += missing
-            if kind[k] == NIBBLE and st.rate > 0.0:
+            if not whole and st.rate > 0.0:
                 _before_it_was_taken(t_ns[k], st, counts)
         else:
             st.seen = np.uint64(1)
-            if kind[k] == FULL:
+            if whole:
                 st.last = counter[k]
                 st.synced = 1
             else:
@@ -322,7 +330,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                     out_values[r, m] = st.values[r] + weight * (values[r, k] - st.values[r])
                 out_counter[m] = (st.last - missing - 1 + j) & (_WRAP - 1)
                 out_filled[m] = 1
-                out_doubt[m] = st.doubt
+                out_doubt[m] = st.doubt | clipped
                 out_gap[m] = 0
                 out_t[m] = t_ns[k]
                 m += 1
@@ -332,11 +340,12 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.values[r] = values[r, k]
         out_counter[m] = st.last & (_WRAP - 1)
         out_filled[m] = 0
-        out_doubt[m] = st.doubt
+        out_doubt[m] = st.doubt | clipped
         out_gap[m] = gap
         out_t[m] = t_ns[k]
         m += 1
         counts[RECEIVED] += 1
+        counts[CLIPPED_SAMPLES] += 1 if clipped else 0
         st.has_last = 1
         st.restarted = 0
         st.correction = 0
@@ -420,7 +429,7 @@ class SampleSequencer:
     def _synchronise(self, events: Events, timing: int) -> None:
         """Give the samples before the first DriveTiming the counters they must have had."""
         self._state["rate"] = self._state["pace"] = events.rate[timing]
-        kinds = events.kind[:timing]
+        kinds = events.kind[:timing] & _KIND
         nibbles = np.flatnonzero(kinds == NIBBLE)
         if not nibbles.size or (kinds == FULL).any():
             return
