@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from contextlib import nullcontext
-
-from ipmsm_can.cli import bus, plain
+from ipmsm_can.cli import bus
 
 HELP = """\
 Follow the drives on a CAN bus: rotor position, speed, and how far to trust them.
@@ -43,28 +40,15 @@ def main(args: argparse.Namespace) -> int:
     bus.check_named(args)
 
     from ipmsm_can.bus.live import LiveRunner
-    from ipmsm_can.bus.port import BusError
     from ipmsm_can.bus.warmup import warm_up_companion
     from ipmsm_can.cli.monitor import RunMonitor
-    from ipmsm_can.cli.screen import Screen
     from ipmsm_can.companion import Companion
     from ipmsm_can.config.build import build_protocol
 
     protocol = build_protocol(configs)
     with bus.patience():
         warm_up_companion(configs, protocol)
-    went_away: BusError | None = None
     with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port:
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates)
         monitor = RunMonitor(runner)
-        with nullcontext() if args.quiet else Screen(monitor.status):
-            try:
-                runner.run(stop, monitor.observe)
-            except BusError as error:
-                went_away = error
-        status = monitor.status()
-    print(plain.summary(status))
-    if went_away is not None:
-        print(f"ipmsm-can run: the bus went away after {status.elapsed:.1f} s: {went_away}", file=sys.stderr)
-        return 1
-    return 0
+        return bus.serve("run", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)[0]
