@@ -394,7 +394,7 @@ def test_several_drives(tmp_path: Path, protocol: Protocol, capsys: pytest.Captu
 def test_a_log_cut_off_is_replayed_as_far_as_it_goes(tmp_path: Path, protocol: Protocol,
                                                      capsys: pytest.CaptureFixture[str]) -> None:
     frames = drive_frames(protocol, 2.0)
-    for name in ("a.blf", "a.log.gz"):
+    for name in ("a.blf", "a.log.gz", "a.asc"):
         log, out = tmp_path / name, tmp_path / "a.csv"
         write_log(log, [frames.take(slice(k, k + 1000)) for k in range(0, len(frames), 1000)])
         log.write_bytes(log.read_bytes()[:int(0.7 * log.stat().st_size)])

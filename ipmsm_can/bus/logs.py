@@ -8,6 +8,7 @@ Every other format goes through python-can.
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -251,6 +252,7 @@ class LogReader:
             raise ValueError(f"block_frames is {block_frames}; allowed is 1 or more")
         self.path = Path(path)
         self.problem = ""
+        self._lines: _WholeLines | None = None
         self._counts = np.zeros(2, np.int64)
         self._block_frames = block_frames
         self._channel = channel
@@ -326,13 +328,17 @@ class LogReader:
         if kind not in MESSAGE_READERS:
             raise LogError(f"{self.path} has the suffix {kind!r}; allowed are "
                            f"{', '.join(sorted(MESSAGE_READERS))}, with or without .gz")
+        reader: Any = MESSAGE_READERS[kind]
+        opened: can.io.generic.MessageReader
         try:
-            if not self._packed:
-                return can.LogReader(self.path)
-            # python-can's own way of unpacking refuses names with one more dot in them
-            reader: Any = MESSAGE_READERS[kind]
-            mode = "rt" if issubclass(reader, TextIOMessageReader) else "rb"
-            opened: can.io.generic.MessageReader = reader(gzip.open(self.path, mode))  # noqa: SIM115
+            if issubclass(reader, TextIOMessageReader):
+                self._lines = _WholeLines(_open(self.path, self._packed, "rb"))
+                opened = reader(self._lines)
+            elif self._packed:
+                # python-can's own way of unpacking refuses names with one more dot in them
+                opened = reader(_open(self.path, self._packed, "rb"))
+            else:
+                opened = can.LogReader(self.path)
             return opened
         except Exception as error:  # every format's reader raises what it likes
             raise LogError(f"{self.path} cannot be read as {kind}: {_words(error)}") from error
@@ -355,9 +361,19 @@ class LogReader:
                 raise LogError(self.problem) from error
         finally:
             reader.stop()
-        self.problem = self.problem or self._blf_problem(reader)
+        self.problem = self.problem or self._blf_problem(reader) or self._text_problem()
         if waiting:
             yield block_from_messages(waiting)
+
+    def _text_problem(self) -> str:
+        """Nor does it mind a text that ends within a line, or an ASC file whose block was begun and never ended."""
+        if self._lines is None:
+            return ""
+        if self._lines.rest:
+            return f"{self.path} is cut off: its last line has no end and is left out"
+        if self._lines.open_block:
+            return f"{self.path} is cut off: it has no line 'End TriggerBlock'"
+        return ""
 
     def _blf_problem(self, reader: can.io.generic.MessageReader) -> str:
         """python-can reads a BLF file that ends too early without a word; its header knows the whole size."""
@@ -366,6 +382,29 @@ class LogReader:
         if promised <= there:
             return ""
         return f"{self.path} is cut off: its header promises {promised} bytes and {there} are there"
+
+
+class _WholeLines(io.TextIOWrapper):
+    """The lines of a text that have an end: half a line of python-can's formats reads like a shorter frame.
+
+    rest: a last line without an end, "" if there is none.  open_block: an ASC file's block was begun, not ended.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        super().__init__(cast("io.BufferedReader", stream), encoding="utf-8", errors="replace")
+        self.rest = ""
+        self.open_block = False
+
+    def __next__(self) -> str:  # type: ignore[override]  # typeshed has it yield bytes here
+        line = super().__next__()
+        if line[0] in "BEbe":
+            words = line.lower().split(maxsplit=2)[:2]
+            self.open_block = words == ["begin", "triggerblock"] or (
+                self.open_block and words != ["end", "triggerblock"])
+        if not line.endswith("\n") and line.lower().split() != ["end", "triggerblock"]:
+            self.rest = line
+            raise StopIteration
+        return line
 
 
 def _open(path: Path, packed: bool, mode: str) -> IO[bytes]:
