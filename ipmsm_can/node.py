@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ipmsm_can.config.build import estimator_settings, injection_settings
 from ipmsm_can.config.model import DriveConfig
-from ipmsm_can.estimation import confidence, speed
+from ipmsm_can.estimation import clipping, confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.injection import meter
@@ -34,7 +34,7 @@ from ipmsm_can.wire.protocol import (
     Protocol,
 )
 from ipmsm_can.wire.receive import SampleReceiver
-from ipmsm_can.wire.sequence import SampleRun
+from ipmsm_can.wire.sequence import CLIPPED, SampleRun
 
 STALE_AFTER_NS = 50_000_000
 """Silence of the drive [ns] after which nothing is claimed any more."""
@@ -105,6 +105,7 @@ class Node:
         self._motor = config.build_motor()
         self._settings = estimator_settings(config)
         self.estimator: Estimator | None = None
+        self._clipping = clipping.new_state()
         self.meter = meter.new_state(config.injection.frequency, 1.0)
         self._last_arrival: int | None = None
         self.samples_per_frame = 1
@@ -184,8 +185,17 @@ class Node:
         estimate = estimator.process(run.values, run.gap)
         if withheld.any():
             estimate.flags[withheld] &= 0xFF ^ confidence.VALID
+        clipped = run.doubt & np.uint8(CLIPPED)
+        if self.distrusting or clipped.any():
+            clipping.hold_block(clipped, estimate.regression, estimate.flux, estimate.angle, self._settings.alpha,
+                                1.0 / run.sample_rate, self._clipping, estimate.flags)
         self.note(run, estimate, meter.meter_block(run.values, self.meter))
         return estimate
+
+    @property
+    def distrusting(self) -> bool:
+        """Samples were cut off at the end of their range, and what they spoiled has not faded yet."""
+        return bool(self._clipping["holding"][0])
 
     def note(self, run: SampleRun, estimate: EstimateBlock, hf_current: float) -> None:
         """Keep the newest of these samples as the view; hf_current [A peak]."""

@@ -157,6 +157,45 @@ def test_run_answers_with_transmit_and_follows_the_rotor(config: str, steady: st
     assert np.median(np.abs(errors)) < np.radians(2.0)
 
 
+def test_no_samples_are_a_fault(config: str, tmp_path: Path, steady: str,
+                                capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.toml"
+    other.write_text(M2 + "[wire]\nnode = 5\n")
+    with driving("one of two", "--profile", steady):
+        code = main(["run", config, str(other), "-i", "virtual", "-c", "one of two", "--duration", "1", "--quiet"])
+    out, err = capsys.readouterr()
+    assert code == 1
+    assert err.count("\n") == 1
+    assert err.startswith("ipmsm-can run: drive 5 sent no samples that could be used (identifier 0x105 or 0x125); ")
+    assert "drive 5 (m2): no samples came" in out and "drive 0 (m2): no samples" not in out
+
+
+def test_samples_without_a_rate_are_a_fault(tmp_path: Path, steady: str,
+                                            capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "mute.toml"
+    config.write_text(M2)
+    mute = tmp_path / "drive.toml"
+    mute.write_text(M2 + "[simulation]\ntiming_rate = 0\n")
+    with driving("mute", str(mute), "--profile", steady):
+        assert main(["run", str(config), "-i", "virtual", "-c", "mute", "--duration", "1", "--quiet"]) == 1
+    out, err = capsys.readouterr()
+    assert err.count("\n") == 1 and "drive 0 sent samples but no DriveTiming" in err and "wire.sample_rate" in err
+    assert "drive 0 (m2): no sample could be used: waiting for DriveTiming" in out
+
+
+def test_an_observer_that_never_locked_is_told(config: str, tmp_path: Path, steady: str,
+                                               capsys: pytest.CaptureFixture[str]) -> None:
+    """At standstill, listening, nothing can lock: that is no fault of the bus, but it is to be said."""
+    profile = tmp_path / "still.toml"
+    profile.write_text("speed_rpm = [[0, 0]]\nduration = 60.0\n")
+    for name, words in ((str(profile), True), (steady, False)):
+        with driving("lazy", "--profile", name):
+            assert main(["run", config, "-i", "virtual", "-c", "lazy", "--duration", "1.5", "--quiet"]) == 0
+        told = capsys.readouterr().out
+        assert ("the observer never locked" in told) == words, told
+        assert "never valid" not in told
+
+
 def test_the_drive_obeys_the_companion(config: str, tmp_path: Path) -> None:
     profile = tmp_path / "still.toml"
     profile.write_text("speed_rpm = [[0, 0]]\nduration = 60.0\n")
@@ -256,9 +295,14 @@ def test_signals_end_it_with_a_summary(command: str, number: signal.Signals, con
     assert first.startswith("0:00:01 ")
     os.kill(process.pid, number)
     rest, err = process.communicate(timeout=60)
-    assert process.returncode == 0
-    assert ("no samples came" if command == "run" else "frames sent in") in rest
-    assert err in ("", "compiling kernels (first time only) ...\n")
+    err = err.removeprefix("compiling kernels (first time only) ...\n")
+    if command == "run":
+        assert process.returncode == 1
+        assert "no samples came" in rest
+        assert err.count("\n") == 1 and "drive 0 sent no samples that could be used" in err
+    else:
+        assert (process.returncode, err) == (0, "")
+        assert "frames sent in" in rest
 
 
 @pytest.mark.skipif(os.name != "posix", reason="pseudo-terminals of POSIX")
@@ -278,7 +322,7 @@ def test_on_a_terminal_the_status_is_a_picture_that_leaves_nothing_behind(config
             break
         shown += part
     os.close(master)
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=60) == 1  # no samples came
     enter, leave = shown.index(b"\x1b[?1049h"), shown.rindex(b"\x1b[?1049l")
     picture = bytes(shown[enter:leave])
     assert b"SILENT (listening only)" in picture

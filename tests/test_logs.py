@@ -253,3 +253,40 @@ def test_a_blf_that_ends_too_early_says_so(tmp_path: Path) -> None:
     reader = read_log(path)
     assert 0 < sum(len(b) for b in reader) < count
     assert "is cut off" in reader.problem and str(len(whole)) in reader.problem
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".csv", ".trc", ".asc.gz"])
+@pytest.mark.parametrize("missing", [2, 5, 9, 15])
+def test_a_text_that_ends_within_a_line_says_so(tmp_path: Path, suffix: str, missing: int) -> None:
+    """The half line is no frame: its identifier and half its bytes would read like one."""
+    block = FrameBlock.zeros(50)
+    block.can_id[:] = 0x100
+    block.raw[:, 4] = 8
+    block.raw[:, 8:16] = 0xA5
+    block.t_ns[:] = 1_700_000_000_000_000_000 + np.arange(50) * 1_000_000
+    path = tmp_path / f"a{suffix}"
+    write_log(path, [block], "1")
+    packed = suffix.endswith(".gz")
+    text = (gzip.decompress(path.read_bytes()) if packed else path.read_bytes())
+    assert read_log(path).problem == "" and len(read_all(path)) == 50
+    text = text.split(b"End TriggerBlock")[0][:-missing]
+    path.write_bytes(gzip.compress(text) if packed else text)
+    reader = read_log(path)
+    found = FrameBlock.concat(reader)
+    assert np.array_equal(found.raw, block.raw[:49])
+    assert reader.problem == f"{path} is cut off: its last line has no end and is left out"
+
+
+def test_an_asc_that_ends_between_two_lines_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.asc"
+    write_log(path, [random_block(20, 3, errors=False)], "1")
+    text = path.read_text()
+    assert "Begin Triggerblock" in text and text.endswith("End TriggerBlock\n")
+    for whole in (text, text.rstrip("\n"), text.replace("Begin Trigger", "//").replace("End TriggerBlock\n", "")):
+        path.write_text(whole)
+        reader = read_log(path)
+        assert sum(len(b) for b in reader) == 20 and reader.problem == ""
+    path.write_text(text.replace("End TriggerBlock\n", ""))
+    reader = read_log(path)
+    assert sum(len(b) for b in reader) == 20
+    assert reader.problem == f"{path} is cut off: it has no line 'End TriggerBlock'"

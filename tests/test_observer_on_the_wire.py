@@ -18,8 +18,8 @@ from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.wire.protocol import MessageKind, ObserverKind, Protocol
+from tests.replaying import column, rows_of
 from tests.test_observers import MODULO_PI, SURFACE
-from tests.test_replay import column, rows_of
 
 PROTOCOL = Protocol()
 SURFACE_TOML = '[motor]\npreset = "m2"\nL_d = "10.25 mH"\nL_q = "10.25 mH"\n'

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,8 @@ from ipmsm_can.wire.sequence import (
 
 RATE = 5000.0
 PERIOD_NS = int(1e9 / RATE)
+STEPS = st.integers(1, 40).filter(lambda step: step == 1 or step % 16 != 1)
+"""Without the loss of whole wraps, which only DriveTiming can tell from a stall."""
 
 
 def value(counter: int) -> list[float]:
@@ -316,6 +319,103 @@ def test_change_of_rate_ends_a_run() -> None:
     assert runs[1].gap.tolist() == [RESTARTED]
 
 
+@pytest.mark.parametrize("configured", [None, RATE])
+def test_a_rate_that_the_drive_measures_is_one_rate(configured: float | None) -> None:
+    """Statements that jitter: one run, at the first rate, as if the drive had stated that one again and again."""
+    rng = np.random.default_rng(5)
+    found = []
+    for jitter in (0.0, 1.0):
+        sequencer, sender = SampleSequencer(8, configured), Sender()
+        for k in range(1000, 3000):
+            if k % 50 == 0:
+                sender.timing(k - 1, RATE if k == 1000 else RATE + jitter * rng.uniform(-4.9, 4.9))
+            if k % 97:
+                sender.sample(k)
+        found.append(one(sequencer.push(sender.events())))
+        assert sequencer.count("restarts") == sequencer.count("resyncs") == 0
+    plain, measured = found
+    assert measured.sample_rate == sequencer.sample_rate == RATE
+    assert not measured.gap.any() and not measured.doubt.any()
+    for name in ("counter", "values", "filled"):
+        assert np.array_equal(getattr(measured, name), getattr(plain, name)), name
+
+
+def test_a_configured_rate_gives_way_only_to_one_that_is_another() -> None:
+    for stated, kept in ((4999.7, True), (5004.9, True), (5006.0, False)):
+        sequencer, sender = SampleSequencer(8, RATE), Sender()
+        sender.sample(1000)
+        sender.timing(1000, stated)
+        sender.sample(1001)
+        runs = sequencer.push(sender.events())
+        assert [r.sample_rate for r in runs] == ([RATE] if kept else [RATE, stated])
+        assert sequencer.count("restarts") == (not kept)
+
+
+def test_drift_of_the_rate_is_measured_from_the_first() -> None:
+    """Small steps add up: past the tolerance it is another rate."""
+    sequencer, sender = synced()
+    for k in range(1, 21):
+        sender.timing(1000 + k, RATE + k)
+        sender.sample(1001 + k, t_ns=(1001 + k) * PERIOD_NS)
+    runs = sequencer.push(sender.events())
+    assert [r.sample_rate for r in runs] == [RATE, RATE + 6, RATE + 12, RATE + 18]
+    assert [r.gap[0] for r in runs] == [0, *[RESTARTED] * 3]
+
+
+@pytest.mark.parametrize("off", [-0.9e-3, 0.9e-3])
+def test_the_latest_statement_paces_arrival(off: float) -> None:
+    """First stated 0.9e-3 off, then right.  A minute on, arrival times still tell wraps apart: by the first
+    statement alone they would have run 270 samples away, and every sample would look late or early by wraps."""
+    sequencer, sender = SampleSequencer(8), Sender()
+    first = 3_000_000_000
+    sender.timing(first, RATE * (1.0 + off))
+    sender.timing(first, RATE)
+    n = 60 * int(RATE)
+    k = np.arange(first + 1, first + 1 + n, dtype=np.int64)
+    before = sender.events()
+    samples = Events(np.zeros(n, np.int64), k & 15, np.zeros(n), k * PERIOD_NS, np.zeros((4, n)))
+    run = one(sequencer.push(Events.joined([before, samples])))
+    assert np.array_equal(run.counter, k) and not run.doubt.any()
+    # A hair's change of the rate is no change of the time of day, however far the counter has come.
+    sender.timing(int(k[-1]), RATE * (1.0 - 0.1 * off))
+    # A sender held up for 20 samples, who then catches up: doubted until it has, and no longer.
+    for j in range(int(k[-1]) + 1, int(k[-1]) + 101):
+        sender.sample(j, t_ns=max(j, int(k[-1]) + 21) * PERIOD_NS)
+    late = one(sequencer.push(sender.events()))
+    assert late.doubt[0] and not late.doubt[20:].any()
+    assert np.array_equal(late.counter, np.arange(k[-1] + 1, k[-1] + 101))
+    assert sequencer.count("lost") == sequencer.count("resyncs") == 0
+
+
+@given(st.lists(st.tuples(STEPS, st.booleans(), st.floats(-6.0, 6.0)), min_size=1, max_size=80),
+       st.lists(st.integers(1, 30), min_size=1, max_size=20))
+def test_a_jittering_rate_gives_the_same_bits_in_any_blocks(steps: list[tuple[int, bool, float]],
+                                                            cuts: list[int]) -> None:
+    sender = Sender()
+    sender.timing(99)
+    k = 100
+    for step, timed, off in steps:
+        sender.sample(k)
+        if timed:
+            sender.timing(k, RATE + off)
+        k += step
+    events = sender.events()
+    whole = SampleSequencer(4)
+    expected = whole.push(events)
+    parts, begin = SampleSequencer(4), 0
+    runs: list[SampleRun] = []
+    while begin < len(events):
+        end = begin + cuts[begin % len(cuts)]
+        runs += parts.push(events.take(slice(begin, end)))
+        begin = end
+    assert np.array_equal(parts.state, whole.state) and np.array_equal(parts.counts, whole.counts)
+    for name in ("counter", "values", "filled", "doubt", "gap", "t_ns"):
+        assert np.array_equal(np.concatenate([getattr(r, name) for r in runs], axis=-1),
+                              np.concatenate([getattr(r, name) for r in expected], axis=-1)), name
+    rates = [np.repeat([r.sample_rate for r in each], [r.counter.size for r in each]) for each in (runs, expected)]
+    assert np.array_equal(rates[0], rates[1])
+
+
 def test_absurd_rates_are_refused() -> None:
     sequencer, sender = synced()
     for rate in (0.0, 50.0, 4e6, float("nan"), float("inf")):
@@ -351,10 +451,6 @@ def test_whole_counters_need_no_guess() -> None:
     assert run.counter.tolist() == [1001, 1500]
     assert run.gap.tolist() == [0, 498]
     assert sequencer.count("duplicates") + sequencer.count("reordered") == 2
-
-
-STEPS = st.integers(1, 40).filter(lambda step: step == 1 or step % 16 != 1)
-"""Without the loss of whole wraps, which only DriveTiming can tell from a stall."""
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(STEPS, min_size=1, max_size=60),

@@ -603,7 +603,7 @@ struct ipmsm_can_drive_timing_t {
     uint32_t sample_counter;
 
     /**
-     * Number of samples per second [Hz].
+     * Number of samples per second [Hz], nominal or measured: changes of up to 0.1 % are taken for jitter of the measurement.
      *
      * Range: 0..4294967295 (0..4294967.295 Hz)
      * Scale: 0.001

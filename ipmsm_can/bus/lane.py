@@ -142,7 +142,7 @@ class FastLane:
             decoder(MessageKind.DRIVE_SAMPLE), decoder(MessageKind.DRIVE_TIMING), decoder(MessageKind.DRIVE_STATUS),
             frame(MessageKind.DRIVE_REFERENCE), encoder(MessageKind.POSITION_ESTIMATE, self._node.position_rows),
             encoder(MessageKind.ACTIVE_FLUX_ESTIMATE, self._node.flux_rows),
-            encoder(MessageKind.COMPANION_STATUS, none), protection.data_ids)
+            encoder(MessageKind.COMPANION_STATUS, none), protection.data_ids, self._node.receiver.sample_ends)
         self._state_row = codecs[MessageKind.COMPANION_STATUS].index["state"]
         table, out = port.tables
         raw = np.zeros((loop.MOST, 72), np.uint8)
@@ -180,7 +180,8 @@ class FastLane:
         """Whether samples flow and nothing but samples is due now."""
         node = self._node
         return (node.estimator is not None and node.running and node.flowing(now_ns)
-                and node.samples_per_frame == 1 and node.quiet_ns(now_ns) > 0 and self._room_for_answers())
+                and node.samples_per_frame == 1 and node.quiet_ns(now_ns) > 0 and not node.distrusting
+                and self._room_for_answers())
 
     def _room_for_answers(self) -> bool:
         """Whether the port's table can hold what one batch can call for, every loss in it filled."""

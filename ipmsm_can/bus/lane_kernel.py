@@ -23,6 +23,7 @@ from ipmsm_can.wire.answers import due_among, flux_values, position_values, trac
 from ipmsm_can.wire.e2e import crc_p02
 from ipmsm_can.wire.kernels import decode_block, encode_block
 from ipmsm_can.wire.protocol import PROTOCOL_VERSION, DriveMode
+from ipmsm_can.wire.receive import is_clipped
 from ipmsm_can.wire.sequence import NIBBLE, SEQUENCED, TIMING, sequence
 
 MOST = 64
@@ -78,7 +79,8 @@ class Encoder(NamedTuple):
 
 
 class Wire(NamedTuple):
-    """The messages; reference: header word of DriveReference, which is only counted."""
+    """The messages; reference: header word of DriveReference, which is only counted; ends: `range_ends` of
+    a DriveSample."""
 
     sample: Decoder
     timing: Decoder
@@ -88,6 +90,7 @@ class Wire(NamedTuple):
     flux: Encoder
     companion: Encoder
     data_ids: Bytes
+    ends: Floats
 
 
 class Incoming(NamedTuple):
@@ -278,6 +281,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 decode_block(words, row, True, 1, s.table, s.scaling, s.ranges, one)
                 for r in range(4):
                     part[r, events] = one[s.rows[r], 0]
+                strange |= is_clipped(part, 0, events, wire.ends)
                 kind[events] = NIBBLE
                 low[events] = np.int64(one[s.rows[4], 0])
                 events += 1

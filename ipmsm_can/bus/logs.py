@@ -1,13 +1,14 @@
 """Recorded buses: logs of every format python-can knows as blocks of frames, and back.
 
-candump's text (`candump -L`, `.log`) has a compiled reader and writer of its own, which keep time stamps
-exact and the details of error frames; python-can's take one Python object per frame and lose those.
+candump's text (`candump -L`, `.log`) has a compiled reader and writer of its own, in `candump`, which keep time
+stamps exact and the details of error frames; python-can's take one Python object per frame and lose those.
 Every other format goes through python-can.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -15,9 +16,8 @@ from types import TracebackType
 from typing import IO, TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ipmsm_can._jit import kernel
+from ipmsm_can.bus import candump
 from ipmsm_can.bus.pythoncan import block_from_messages, messages_from_block
 from ipmsm_can.frames import FRAME_BYTES, FrameBlock
 
@@ -31,210 +31,6 @@ _BROKEN = (EOFError, zlib.error, gzip.BadGzipFile)
 
 class LogError(ValueError):
     """A log that cannot be read or written; the sentence says which and why."""
-
-
-# ---- candump text -------------------------------------------------------------------------------------
-
-@kernel
-def _nibble(character: int) -> int:
-    """Value of a hexadecimal digit, or -1."""
-    if 48 <= character <= 57:
-        return character - 48
-    if 65 <= character <= 70:
-        return character - 55
-    if 97 <= character <= 102:
-        return character - 87
-    return -1
-
-
-@kernel
-def _parse_payload(text: NDArray[np.uint8], at: int, end: int, row: NDArray[np.uint8]) -> int:
-    """Read what follows the first '#' into a row (identifier already there); position after it, or -1."""
-    room = 8
-    if at < end and text[at] == 35:  # '#': CAN FD, one digit of flags
-        flags = _nibble(text[at + 1]) if at + 1 < end else -1
-        if flags < 0:
-            return -1
-        row[5] = 0x04 | (flags & 0x03)
-        room = 64
-        at += 2
-    elif at < end and (text[at] == 82 or text[at] == 114):  # 'R': remote, with or without a length
-        row[3] |= 0x40
-        at += 1
-        length = _nibble(text[at]) if at < end else -1
-        if length >= 0:
-            at += 1
-            row[4] = min(length, 8)
-        room = 0
-    n = 0
-    while at + 1 < end:
-        if text[at] == 46 and n > 0:  # '.' may stand between bytes
-            at += 1
-            continue
-        high = _nibble(text[at])
-        low = _nibble(text[at + 1])
-        if high < 0:
-            break
-        if low < 0 or n >= room:
-            return -1
-        row[8 + n] = 16 * high + low
-        n += 1
-        at += 2
-    if room:
-        row[4] = n
-    if at + 1 < end and text[at] == 95 and _nibble(text[at + 1]) >= 0:  # '_' and the raw DLC
-        at += 2
-    return at
-
-
-@kernel
-def _parse_line(text: NDArray[np.uint8], at: int, end: int, channel: NDArray[np.uint8],
-                row: NDArray[np.uint8]) -> tuple[int, int]:
-    """One line without its newline: (kind, time in ns).
-
-    kind: 1 a frame, 0 nothing for us, -1 not understood.
-    """
-    while at < end and text[at] <= 32:
-        at += 1
-    if at == end:
-        return 0, 0
-    if text[at] != 40:  # '('
-        return -1, 0
-    at += 1
-    seconds = 0
-    digits = 0
-    while at < end and 48 <= text[at] <= 57 and digits < 10:
-        seconds = 10 * seconds + (text[at] - 48)
-        at += 1
-        digits += 1
-    if digits == 0 or at == end or text[at] != 46:  # '.'
-        return -1, 0
-    at += 1
-    fraction = 0
-    scale = 1_000_000_000
-    while at < end and 48 <= text[at] <= 57:
-        if scale > 1:
-            scale //= 10
-            fraction += scale * (text[at] - 48)
-        at += 1
-    if at == end or text[at] != 41 or scale == 1_000_000_000:  # ')'
-        return -1, 0
-    at += 1
-    t_ns = seconds * 1_000_000_000 + fraction
-    while at < end and text[at] <= 32:
-        at += 1
-    begin = at
-    while at < end and text[at] > 32:
-        at += 1
-    wanted = True
-    if channel.shape[0]:
-        wanted = at - begin == channel.shape[0]
-        for k in range(channel.shape[0]):
-            wanted = wanted and text[begin + k] == channel[k]
-    while at < end and text[at] <= 32:
-        at += 1
-    can_id = 0
-    digits = 0
-    while at < end and _nibble(text[at]) >= 0 and digits < 9:
-        can_id = 16 * can_id + _nibble(text[at])
-        at += 1
-        digits += 1
-    if not 1 <= digits <= 8 or at == end or text[at] != 35:  # '#'
-        return -1, 0
-    if digits <= 3:
-        can_id &= 0x7FF
-    elif can_id & 0x20000000:
-        can_id &= 0x3FFFFFFF
-    else:
-        can_id = (can_id & 0x1FFFFFFF) | 0x80000000
-    for k in range(72):
-        row[k] = 0
-    for k in range(4):
-        row[k] = (can_id >> (8 * k)) & 0xFF
-    at = _parse_payload(text, at + 1, end, row)
-    if at < 0 or (at < end and text[at] > 32):
-        return -1, 0
-    return (1 if wanted else 0), t_ns
-
-
-@kernel
-def _parse(text: NDArray[np.uint8], start: int, channel: NDArray[np.uint8], raw: NDArray[np.uint8],
-           t_ns: NDArray[np.int64], rows: int, counts: NDArray[np.int64]) -> tuple[int, int]:
-    """Parse whole lines from start until the text ends or the rows are full: (position, rows filled).
-
-    counts: lines understood, lines not understood.
-    """
-    at = start
-    while at < text.shape[0] and rows < raw.shape[0]:
-        end = at
-        while end < text.shape[0] and text[end] != 10:
-            end += 1
-        kind, stamp = _parse_line(text, at, end, channel, raw[rows])
-        if kind < 0:
-            counts[1] += 1
-        elif kind > 0:
-            t_ns[rows] = stamp
-            rows += 1
-            counts[0] += 1
-        at = end + 1
-    return at, rows
-
-
-@kernel
-def _digits(value: int, base: int, width: int, out: NDArray[np.uint8], at: int) -> int:
-    for k in range(width):
-        digit = value % base
-        out[at + width - 1 - k] = 48 + digit if digit < 10 else 55 + digit
-        value //= base
-    return at + width
-
-
-@kernel
-def _format(raw: NDArray[np.uint8], t_ns: NDArray[np.int64], channel: NDArray[np.uint8],
-            out: NDArray[np.uint8]) -> int:
-    """Lines as candump -L writes them; returns how many bytes."""
-    at = 0
-    for row in range(raw.shape[0]):
-        micro = max(t_ns[row], 0) // 1000
-        out[at] = 40
-        at = _digits(micro // 1_000_000, 10, 10, out, at + 1)
-        out[at] = 46
-        at = _digits(micro % 1_000_000, 10, 6, out, at + 1)
-        out[at] = 41
-        out[at + 1] = 32
-        at += 2
-        for k in range(channel.shape[0]):
-            out[at + k] = channel[k]
-        at += channel.shape[0]
-        out[at] = 32
-        at += 1
-        can_id = 0
-        for k in range(4):
-            can_id += raw[row, k] * (1 << (8 * k))
-        if can_id & 0x20000000:
-            at = _digits(can_id & 0x3FFFFFFF, 16, 8, out, at)
-        elif can_id & 0x80000000:
-            at = _digits(can_id & 0x1FFFFFFF, 16, 8, out, at)
-        else:
-            at = _digits(can_id & 0x7FF, 16, 3, out, at)
-        out[at] = 35
-        at += 1
-        is_fd = raw[row, 5] & 0x04
-        length = min(0 + raw[row, 4], 64 if is_fd else 8)
-        if is_fd:
-            out[at] = 35
-            at = _digits(raw[row, 5] & 0x03, 16, 1, out, at + 1)
-        if can_id & 0x40000000 and not can_id & 0x20000000:
-            out[at] = 82
-            at += 1
-            if length:
-                at = _digits(length, 10, 1, out, at)
-        else:
-            for k in range(length):
-                at = _digits(raw[row, 8 + k], 16, 2, out, at)
-        out[at] = 10
-        at += 1
-    return at
 
 
 # ---- reading ------------------------------------------------------------------------------------------
@@ -251,6 +47,7 @@ class LogReader:
             raise ValueError(f"block_frames is {block_frames}; allowed is 1 or more")
         self.path = Path(path)
         self.problem = ""
+        self._lines: _WholeLines | None = None
         self._counts = np.zeros(2, np.int64)
         self._block_frames = block_frames
         self._channel = channel
@@ -305,7 +102,7 @@ class LogReader:
             for text in self._texts(stream):
                 characters, at = np.frombuffer(text, np.uint8), 0
                 while at < len(characters):
-                    at, rows = _parse(characters, at, channel, block.raw, block.t_ns, rows, self._counts)
+                    at, rows = candump.parse(characters, at, channel, block.raw, block.t_ns, rows, self._counts)
                     if rows == self._block_frames:
                         yield block
                         block, rows = FrameBlock.zeros(self._block_frames), 0
@@ -326,13 +123,17 @@ class LogReader:
         if kind not in MESSAGE_READERS:
             raise LogError(f"{self.path} has the suffix {kind!r}; allowed are "
                            f"{', '.join(sorted(MESSAGE_READERS))}, with or without .gz")
+        reader: Any = MESSAGE_READERS[kind]
+        opened: can.io.generic.MessageReader
         try:
-            if not self._packed:
-                return can.LogReader(self.path)
-            # python-can's own way of unpacking refuses names with one more dot in them
-            reader: Any = MESSAGE_READERS[kind]
-            mode = "rt" if issubclass(reader, TextIOMessageReader) else "rb"
-            opened: can.io.generic.MessageReader = reader(gzip.open(self.path, mode))  # noqa: SIM115
+            if issubclass(reader, TextIOMessageReader):
+                self._lines = _WholeLines(_open(self.path, self._packed, "rb"))
+                opened = reader(self._lines)
+            elif self._packed:
+                # python-can's own way of unpacking refuses names with one more dot in them
+                opened = reader(_open(self.path, self._packed, "rb"))
+            else:
+                opened = can.LogReader(self.path)
             return opened
         except Exception as error:  # every format's reader raises what it likes
             raise LogError(f"{self.path} cannot be read as {kind}: {_words(error)}") from error
@@ -355,9 +156,19 @@ class LogReader:
                 raise LogError(self.problem) from error
         finally:
             reader.stop()
-        self.problem = self.problem or self._blf_problem(reader)
+        self.problem = self.problem or self._blf_problem(reader) or self._text_problem()
         if waiting:
             yield block_from_messages(waiting)
+
+    def _text_problem(self) -> str:
+        """Nor does it mind a text that ends within a line, or an ASC file whose block was begun and never ended."""
+        if self._lines is None:
+            return ""
+        if self._lines.rest:
+            return f"{self.path} is cut off: its last line has no end and is left out"
+        if self._lines.open_block:
+            return f"{self.path} is cut off: it has no line 'End TriggerBlock'"
+        return ""
 
     def _blf_problem(self, reader: can.io.generic.MessageReader) -> str:
         """python-can reads a BLF file that ends too early without a word; its header knows the whole size."""
@@ -366,6 +177,29 @@ class LogReader:
         if promised <= there:
             return ""
         return f"{self.path} is cut off: its header promises {promised} bytes and {there} are there"
+
+
+class _WholeLines(io.TextIOWrapper):
+    """The lines of a text that have an end: half a line of python-can's formats reads like a shorter frame.
+
+    rest: a last line without an end, "" if there is none.  open_block: an ASC file's block was begun, not ended.
+    """
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        super().__init__(cast("io.BufferedReader", stream), encoding="utf-8", errors="replace")
+        self.rest = ""
+        self.open_block = False
+
+    def __next__(self) -> str:  # type: ignore[override]  # typeshed has it yield bytes here
+        line = super().__next__()
+        if line[0] in "BEbe":
+            words = line.lower().split(maxsplit=2)[:2]
+            self.open_block = words == ["begin", "triggerblock"] or (
+                self.open_block and words != ["end", "triggerblock"])
+        if not line.endswith("\n") and line.lower().split() != ["end", "triggerblock"]:
+            self.rest = line
+            raise StopIteration
+        return line
 
 
 def _open(path: Path, packed: bool, mode: str) -> IO[bytes]:
@@ -426,7 +260,7 @@ class LogWriter:
         name = np.frombuffer(self._channel.encode(), np.uint8)
         raw = np.ascontiguousarray(block.raw)
         text = np.empty(len(block) * (41 + len(name) + 2 * (FRAME_BYTES - 8)), np.uint8)
-        size = _format(raw, np.ascontiguousarray(block.t_ns), name, text)
+        size = candump.format_rows(raw, np.ascontiguousarray(block.t_ns), name, text)
         self._stream.write(text[:size].tobytes())
 
     def flush(self) -> None:

@@ -74,6 +74,7 @@ def _frames(protocol: Protocol, node: int, begin: int, fd: bool) -> FrameBlock:
                                                          "protocol_version": PROTOCOL_VERSION * one}),
         protocol.encode(MessageKind.DRIVE_REFERENCE, node, {"sample_counter": last})]
     if fd:
+        values["i_alpha"][0] = 1e9  # cut off
         starts = k[::BLOCK_SAMPLES]
         blocks = {f"{axis}_{j}": v[j::BLOCK_SAMPLES] for axis, v in values.items() for j in range(BLOCK_SAMPLES)}
         samples = protocol.encode(MessageKind.DRIVE_SAMPLE_BLOCK, node, {

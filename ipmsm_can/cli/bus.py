@@ -11,13 +11,16 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.port import Port
+    from ipmsm_can.cli.status import DriveStatus, RunStatus
     from ipmsm_can.config import DriveConfig
+
+S = TypeVar("S", "RunStatus", "DriveStatus")
 
 _FILTER_HELP = ("Let only these identifiers in, hexadecimal: <id>:<mask> passes what equals id in the bits of "
                 "mask, so 100:70F passes everything of drive 0 below 0x200")
@@ -132,6 +135,30 @@ def stop_on_signals(duration: float | None = None) -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def serve(command: str, run: Callable[[], None], status: Callable[[], S], quiet: bool) -> tuple[int, S]:
+    """Run until it ends, with the status shown meanwhile unless quiet, and print how it went.
+
+    run, status: of a runner and its monitor.  Returns the exit code, 1 where the bus went away, else 0, and the
+    last status.
+    """
+    from ipmsm_can.bus.port import BusError
+    from ipmsm_can.cli import plain
+    from ipmsm_can.cli.screen import Screen
+
+    went_away: BusError | None = None
+    with nullcontext() if quiet else Screen(status):
+        try:
+            run()
+        except BusError as error:
+            went_away = error
+    last = status()
+    print(plain.summary(last))
+    if went_away is None:
+        return 0, last
+    print(f"ipmsm-can {command}: the bus went away after {last.elapsed:.1f} s: {went_away}", file=sys.stderr)
+    return 1, last
 
 
 @contextmanager

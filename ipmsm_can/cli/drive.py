@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ipmsm_can.cli import bus, plain
+from ipmsm_can.cli import bus
 
 if TYPE_CHECKING:
     from ipmsm_can.config import DriveConfig
@@ -88,10 +86,8 @@ def main(args: argparse.Namespace) -> int:
     bus.check_named(args)
 
     from ipmsm_can.bus.drive_runner import DriveRunner
-    from ipmsm_can.bus.port import BusError
     from ipmsm_can.bus.warmup import warm_up_drives
     from ipmsm_can.cli.monitor import DriveMonitor
-    from ipmsm_can.cli.screen import Screen
     from ipmsm_can.config.build import build_protocol
 
     profile = read_profile(args.profile)
@@ -101,21 +97,10 @@ def main(args: argparse.Namespace) -> int:
         warm_up_drives(build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args), protocol)
     drives = build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args)
     duration = profile.duration if args.duration is None else args.duration
-    went_away: BusError | None = None
     with bus.stop_on_signals(duration) as stop, bus.open_bus(args, fd) as port:
         runner = DriveRunner(port, drives, args.tick)
         monitor = DriveMonitor(runner, duration)
-        with nullcontext() if args.quiet else Screen(monitor.status):
-            try:
-                runner.run(stop, monitor.observe)
-            except BusError as error:
-                went_away = error
-        status = monitor.status()
-    print(plain.summary(status))
-    if went_away is not None:
-        print(f"ipmsm-can drive: the bus went away after {status.elapsed:.1f} s: {went_away}", file=sys.stderr)
-        return 1
-    return 0
+        return bus.serve("drive", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)[0]
 
 
 def read_profile(name: str) -> Profile:

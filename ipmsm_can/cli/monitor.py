@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ipmsm_can.bus.errors import ErrorCounters
 from ipmsm_can.cli.status import BusStatus, DriveNodeStatus, DriveStatus, NodeStatus, RunStatus
 from ipmsm_can.estimation import confidence
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 _RATE_WINDOW_S = 1.0
 _QUANTILES_EVERY_S = 1.0
+_SETTLED = confidence.LOCKED | confidence.VALID
 RPM = 30.0 / math.pi
 
 STATE_WORDS = {
@@ -65,12 +68,17 @@ class RunMonitor:
         self.errors = ErrorCounters()
         self._begin = time.monotonic()
         self._errors_seen = 0
+        self._ever: dict[int, int] = {}
         self._rates = Rates(self._begin)
         self._turnaround = (math.nan, math.nan)
         self._next_quantiles = 0.0
 
     def observe(self, block: FrameBlock, tracked: Sequence[Tracked], answers: FrameBlock, now_ns: int) -> None:
-        """Count error frames; next to nothing when there are none."""
+        """Count error frames, and note who locks; next to nothing when there is nothing new."""
+        for part in tracked:
+            seen = self._ever.setdefault(part.node, 0)
+            if seen & _SETTLED != _SETTLED:
+                self._ever[part.node] = seen | int(np.bitwise_or.reduce(part.estimate.flags))
         seen = self.runner.companion.counts.errors
         if seen != self._errors_seen:
             self._errors_seen = seen
@@ -98,12 +106,13 @@ class RunMonitor:
             remote=counts.remote, wrong_length=counts.wrong_length, drops=port.drops,
             error_frames=self.errors.frames, errors=self.errors.summary(),
             turnaround_p50=self._turnaround[0], turnaround_p99=self._turnaround[1])
-        nodes = tuple(_node_status(node, rates[f"samples {number}"], rates[f"estimates {number}"])
+        nodes = tuple(_node_status(node, rates[f"samples {number}"], rates[f"estimates {number}"],
+                                   self._ever.get(number, 0))
                       for number, node in companion.nodes.items())
         return RunStatus(self.title, now - self._begin, companion.transmit, bus, nodes)
 
 
-def _node_status(node: Node, samples_per_s: float, estimates_per_s: float) -> NodeStatus:
+def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever: int) -> NodeStatus:
     view, scheduler = node.view, node.scheduler
     count = node.receiver.sequencer.count
     motor = node.config.build_motor()
@@ -119,7 +128,9 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float) -> No
         sample_rate=view.sample_rate, samples_per_s=samples_per_s, estimates_per_s=estimates_per_s,
         received=count("received"), lost=count("lost"), filled=count("filled"), gaps=count("gaps"),
         duplicates=count("duplicates"), reordered=count("reordered"), resyncs=count("resyncs"),
-        restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands)
+        restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands,
+        clipped=count("clipped"), distrusting=node.distrusting,
+        ever_locked=bool(ever & confidence.LOCKED), ever_valid=bool(ever & confidence.VALID))
 
 
 def injection_words(state: InjectionState, reason: InjectionReason, amplitude: float) -> str:

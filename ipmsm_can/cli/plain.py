@@ -39,7 +39,7 @@ def losses(node: NodeStatus) -> list[tuple[str, int]]:
     """What went wrong with the samples, in the order of the display."""
     return [("lost", node.lost), ("filled", node.filled), ("gaps", node.gaps), ("bad frames", node.bad_frames),
             ("duplicates", node.duplicates), ("reordered", node.reordered), ("resyncs", node.resyncs),
-            ("restarts", node.restarts)]
+            ("restarts", node.restarts), ("cut off", node.clipped)]
 
 
 def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:
@@ -84,10 +84,15 @@ def summary(status: Status) -> str:
         lines.append(f"answers: turnaround {turnaround(bus)}, unsent {bus.unsent}, too late {bus.late}")
     for n in status.nodes:
         if not n.received:
-            lines.append(f"drive {n.node} ({n.motor}): no samples came")
+            why = f"no sample could be used: {n.state}" if "DriveTiming" in n.state else "no samples came"
+            lines.append(f"drive {n.node} ({n.motor}): {why}")
             continue
         lines.append(f"drive {n.node} ({n.motor}): {n.received} samples, "
                      + ", ".join(f"{name} {count}" for name, count in losses(n)))
         known = f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm" if n.live else ""
         lines.append(f"  last: {n.state}{known}")
+        if not n.ever_locked:
+            lines.append("  the observer never locked: no angle of this drive could be used")
+        elif not n.ever_valid:
+            lines.append("  the angle was never valid")
     return "\n".join(lines)

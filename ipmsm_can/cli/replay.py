@@ -68,12 +68,13 @@ def main(args: argparse.Namespace) -> int:
     """Replay; returns the exit code."""
     from ipmsm_can.bus.logs import read_log
     from ipmsm_can.config import load_configs
+    from ipmsm_can.config.build import build_protocol
 
     log = Path(args.log)
     configs = load_configs(args.drive)
     paths = _row_paths(args.out, configs, [log, *map(Path, args.drive)])
     reader = read_log(log, block_frames=_BLOCK_FRAMES, channel=args.channel)
-    protocol = _protocol(configs)
+    protocol = build_protocol(configs)
     session = Session(configs, protocol, paths)
     _leave_on_sigterm()
     try:
@@ -122,18 +123,6 @@ def _row_paths(out: str | None, configs: Sequence[DriveConfig], inputs: Sequence
         if any(target.exists() and given.exists() and target.samefile(given) for given in inputs):
             raise ValueError(f"--out {target} is one of the input files; allowed is another file")
     return paths
-
-
-def _protocol(configs: Sequence[DriveConfig]) -> Protocol:
-    """The protocol all drives share.  Raises ValueError where they name different databases."""
-    from ipmsm_can.wire.dbc import Database
-    from ipmsm_can.wire.protocol import Protocol
-
-    named = {c.wire.dbc.resolve() if c.wire.dbc else None for c in configs}
-    if len(named) > 1:
-        raise ValueError("the drives name different files in wire.dbc; allowed is one for all drives of a log")
-    path = named.pop()
-    return Protocol(Database.load(path) if path else None)
 
 
 class Session:
@@ -227,7 +216,7 @@ def _node_lines(number: int, s: NodeSummary, replay: Replay) -> list[str]:
     lines = [f"node {number}: {s.rows} samples over {s.duration:.3f} s at {s.sample_rate:g} Hz",
              f"  wire       {count('lost')} lost, {count('filled')} of them filled; {count('gaps')} gaps, "
              f"{count('duplicates')} duplicates, {count('reordered')} late, {count('restarts')} restarts, "
-             f"{count('resyncs')} resyncs, {node.bad_frames} bad frames"]
+             f"{count('resyncs')} resyncs, {node.bad_frames} bad frames, {count('clipped')} cut off"]
     if not s.rows:
         return [f"node {number}: no samples", lines[1]]
     lines.append(f"  lock       {_when('first locked', s.first_locked)}, locked {_share(s.locked, s.rows)}; "

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
-from ipmsm_can.cli import bus, plain
+from ipmsm_can.cli import bus
+
+if TYPE_CHECKING:
+    from ipmsm_can.node import Node
+    from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
 Follow the drives on a CAN bus: rotor position, speed, and how far to trust them.
@@ -20,7 +24,7 @@ examples:
   CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
 
 On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.
-exit codes: 0 ended by you or by --duration, 1 the bus went away, 2 bad input
+exit codes: 0 ended by you or by --duration, 1 the bus went away or a drive sent no samples, 2 bad input
 """
 
 
@@ -43,28 +47,33 @@ def main(args: argparse.Namespace) -> int:
     bus.check_named(args)
 
     from ipmsm_can.bus.live import LiveRunner
-    from ipmsm_can.bus.port import BusError
     from ipmsm_can.bus.warmup import warm_up_companion
     from ipmsm_can.cli.monitor import RunMonitor
-    from ipmsm_can.cli.screen import Screen
     from ipmsm_can.companion import Companion
     from ipmsm_can.config.build import build_protocol
 
     protocol = build_protocol(configs)
     with bus.patience():
         warm_up_companion(configs, protocol)
-    went_away: BusError | None = None
     with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port:
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates)
         monitor = RunMonitor(runner)
-        with nullcontext() if args.quiet else Screen(monitor.status):
-            try:
-                runner.run(stop, monitor.observe)
-            except BusError as error:
-                went_away = error
-        status = monitor.status()
-    print(plain.summary(status))
-    if went_away is not None:
-        print(f"ipmsm-can run: the bus went away after {status.elapsed:.1f} s: {went_away}", file=sys.stderr)
-        return 1
-    return 0
+        code, status = bus.serve("run", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)
+    silent = [runner.companion.nodes[n.node] for n in status.nodes if not n.received]
+    if code or not silent:
+        return code
+    told = "; ".join(_silence(node, protocol) for node in silent)
+    print(f"ipmsm-can run: {told}; {status.bus.frames} frames came in {status.elapsed:.1f} s", file=sys.stderr)
+    return 1
+
+
+def _silence(node: Node, protocol: Protocol) -> str:
+    """Why there was not one sample of this drive, in half a sentence."""
+    from ipmsm_can.wire.protocol import MessageKind
+
+    if node.receiver.sequencer.waiting:
+        return (f"drive {node.number} sent samples but no DriveTiming, so their rate is unknown (wire.sample_rate "
+                "in its TOML file can say it)")
+    ids = " or ".join(f"0x{protocol.base_ids[kind] + node.number:X}"
+                      for kind in (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK))
+    return f"drive {node.number} sent no samples that could be used (identifier {ids})"

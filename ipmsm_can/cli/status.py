@@ -18,6 +18,8 @@ class NodeStatus:
     theta, sigma [rad electrical], omega [rad/s electrical], rpm [1/min mechanical], excitation [V^2 s].
     hf_current, amplitude: measured current [A peak] and asked voltage [V peak] of the probing signal.
     injection: state and reason in words.  injecting: what the drive says.
+    clipped: samples cut off at the end of their range; distrusting: what they spoiled has not faded yet.
+    ever_locked, ever_valid: the angle was, at some time since the beginning.
     sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
     """
 
@@ -50,6 +52,10 @@ class NodeStatus:
     restarts: int
     bad_frames: int
     rejected_commands: int
+    clipped: int = 0
+    distrusting: bool = False
+    ever_locked: bool = True
+    ever_valid: bool = True
 
     @property
     def known(self) -> bool:
@@ -67,6 +73,8 @@ class NodeStatus:
             return "NOT VALID: angle unknown"
         if not self.polarity_known:
             return "NOT VALID: may be half a turn off"
+        if self.distrusting:
+            return "NOT VALID: samples were cut off"
         return "NOT VALID: not locked" if not self.locked else "NOT VALID: too uncertain"
 
 

@@ -64,7 +64,7 @@ class Summary:
 
     lock_time: from the drive's first sample to the first valid angle; motion_time: to the first motion of
     the rotor; lock_after_motion: between the two.  valid_share: of the time after the first valid angle.
-    samples, lost, filled, gaps, duplicates, reordered, restarts, bad_frames: of the drive's samples.
+    samples, lost, filled, gaps, duplicates, reordered, restarts, bad_frames, clipped: of the drive's samples.
     load_mean, load_peak: 0..1.
     """
 
@@ -90,6 +90,7 @@ class Summary:
     load_mean: float
     load_peak: float
     frames: dict[MessageKind, int]
+    clipped: int = 0
 
     @property
     def lock_after_motion(self) -> float:
@@ -113,6 +114,8 @@ class Summary:
             found.append(f"{self.bus.unsent} frames could not be sent")
         if self.bad_frames:
             found.append(f"{self.bad_frames} frames were damaged")
+        if self.clipped:
+            found.append(f"{self.clipped} samples were cut off at the end of their range")
         if self.restarts:
             found.append(f"the drive's sample counter started anew {self.restarts} times")
         if self.bus.rejected_commands:
@@ -179,6 +182,7 @@ def summarise(record: Record, node: Node, bus: BusFigures) -> Summary:
         load_mean=float(settled.mean()) if settled.size else math.nan,
         load_peak=float(settled.max()) if settled.size else math.nan,
         frames=record.frames,
+        clipped=count("clipped"),
     )
 
 
@@ -207,7 +211,7 @@ def rows(s: Summary) -> list[tuple[str, str]]:
     micro = [number(1e6 * q, ".0f", "µs") for q in s.bus.turnaround]
     timing = " / ".join(micro) if math.isfinite(s.bus.turnaround[0]) else "– (virtual time)"
     trouble = (f"{s.filled} filled in, {s.gaps} gaps, {s.duplicates} duplicates, {s.reordered} late, "
-               f"{s.bad_frames} damaged")
+               f"{s.bad_frames} damaged, {s.clipped} cut off")
     return [
         ("bus", s.bus.name),
         ("first valid angle", f"{number(s.lock_time, '.2f', 's')} after the first sample, "

@@ -1,17 +1,23 @@
-"""From the frames of one drive to its samples: decoding, end-to-end checks, sequencing, and the counts."""
+"""From the frames of one drive to its samples: decoding, end-to-end checks, sequencing, and the counts.
+
+A value at the end of its signal's range was cut off there: its sample goes on, marked CLIPPED, not to be trusted.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.wire.codec import MessageCodec
 from ipmsm_can.wire.e2e import E2EStatus, SequenceChecker
+from ipmsm_can.wire.kernels import FLOAT, KIND
 from ipmsm_can.wire.protocol import BLOCK_SAMPLES, MessageKind, Protocol
-from ipmsm_can.wire.sequence import DUPLICATES, FULL, NIBBLE, TIMING, Events, SampleRun, SampleSequencer
+from ipmsm_can.wire.sequence import CLIPPED, DUPLICATES, FULL, NIBBLE, TIMING, Events, SampleRun, SampleSequencer
 
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]
@@ -22,13 +28,52 @@ AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
 
 
 @kernel
+def is_clipped(values: Floats, first_row: int, k: int, ends: Floats) -> bool:
+    """One of the four values of column k from first_row on, stands at an end of its range (`range_ends`)."""
+    for r in range(4):
+        value = values[first_row + r, k]
+        for e in range(4):
+            if abs(value - ends[r, e]) <= ends[r, 4]:
+                return True
+    return False
+
+
+@kernel
+def _mark_clipped(values: Floats, ends: Floats, kind: Ints) -> None:
+    for k in range(kind.shape[0]):
+        if is_clipped(values, 0, k, ends):
+            kind[k] += CLIPPED
+
+
+def range_ends(codec: MessageCodec, names: Sequence[str]) -> Floats:
+    """Ends of the range of signals i_alpha, i_beta, v_alpha, v_beta, for `is_clipped`, float64 (4, 5).
+
+    Per signal: the ends of the range that the DBC gives it, those of what its bits can hold, and how near counts:
+    a step and a half, as some senders limit to +-max and leave out the lowest value.  Physical units.
+    """
+    out = np.empty((4, 5))
+    for r, name in enumerate(names):
+        s = codec.index[name]
+        scale, offset, low, high, type_low, type_high = codec.tables.scaling[s].tolist()
+        if codec.tables.table[s, KIND] == FLOAT:
+            # Its limits are physical, and bits that hold 1e38 cut nothing off.
+            near = 1e-6 * max(abs(low), abs(high)) if math.isfinite(high - low) else 0.0
+            out[r] = low, high, low, high, near
+        else:
+            out[r, :4] = np.array([low, high, type_low, type_high]) * scale + offset
+            out[r, 4] = 1.5 * abs(scale)
+    return out
+
+
+@kernel
 def _merge(rows_s: Rows, samples: Floats, rows_t: Rows, timings: Floats, rows_b: Rows,
-           blocks: Floats, first_row: int, t_ns: Ints, kind: Ints, counter: Ints,
+           blocks: Floats, first_row: int, ends_s: Floats, ends_b: Floats, t_ns: Ints, kind: Ints, counter: Ints,
            rate: Floats, t_out: Ints, values: Floats) -> int:
     """Events of sample, timing and block frames in order of arrival; returns how many.
 
     rows_*: where each frame stood in the block.  samples (5, .): i, v, counter.  timings (2, .): counter, rate.
     blocks (30, .): first_sample, sample_count, 7 x (i, v), whose rows begin at first_row.
+    ends_s, ends_b: `range_ends` of a DriveSample and a DriveSampleBlock.
     """
     n = 0
     s = 0
@@ -40,7 +85,7 @@ def _merge(rows_s: Rows, samples: Floats, rows_t: Rows, timings: Floats, rows_b:
         row_t = rows_t[t] if t < rows_t.shape[0] else end
         row_b = rows_b[b] if b < rows_b.shape[0] else end
         if row_s < row_t and row_s < row_b:
-            kind[n] = NIBBLE
+            kind[n] = NIBBLE + (CLIPPED if is_clipped(samples, 0, s, ends_s) else 0)
             counter[n] = int(samples[4, s])
             rate[n] = 0.0
             t_out[n] = t_ns[row_s]
@@ -59,7 +104,7 @@ def _merge(rows_s: Rows, samples: Floats, rows_t: Rows, timings: Floats, rows_b:
             t += 1
         elif row_b < end:
             for j in range(int(blocks[1, b])):
-                kind[n] = FULL
+                kind[n] = FULL + (CLIPPED if is_clipped(blocks, first_row + 4 * j, b, ends_b) else 0)
                 counter[n] = (int(blocks[0, b]) + j) & 0xFFFFFFFF
                 rate[n] = 0.0
                 t_out[n] = t_ns[row_b]
@@ -91,6 +136,8 @@ class SampleReceiver:
         self._block_rows = self._order(MessageKind.DRIVE_SAMPLE_BLOCK, (
             "first_sample", "sample_count",
             *(f"{axis}_{j}" for j in range(BLOCK_SAMPLES) for axis in AXES)))
+        self.sample_ends = range_ends(self._sample, AXES)
+        self._block_ends = range_ends(codecs[MessageKind.DRIVE_SAMPLE_BLOCK], [f"{axis}_0" for axis in AXES])
         self._no_blocks = np.zeros((2 + 4 * BLOCK_SAMPLES, 0))
 
     def _order(self, kind: MessageKind, names: tuple[str, ...]) -> Rows | None:
@@ -107,7 +154,9 @@ class SampleReceiver:
             s = s[self._sample_rows]
         samples, s = self._plausible(samples, s, 4)
         if not timings.size and not blocks.size:
-            events = Events(np.zeros(samples.size, np.int64), s[4].astype(np.int64), np.zeros(samples.size),
+            kind = np.full(samples.size, NIBBLE, np.int64)
+            _mark_clipped(s, self.sample_ends, kind)
+            events = Events(kind, s[4].astype(np.int64), np.zeros(samples.size),
                             block.t_ns[samples], s[:4])
             return self.sequencer.push(events)
         t = self._timing.decode_rows(words, timings)
@@ -121,7 +170,8 @@ class SampleReceiver:
         rate = np.empty(room)
         t_ns = np.empty(room, np.int64)
         values = np.empty((4, room))
-        n = _merge(samples, s, timings, t, blocks, b, 2, block.t_ns, kind, counter, rate, t_ns, values)
+        n = _merge(samples, s, timings, t, blocks, b, 2, self.sample_ends, self._block_ends,
+                   block.t_ns, kind, counter, rate, t_ns, values)
         return self.sequencer.push(Events(kind[:n], counter[:n], rate[:n], t_ns[:n],
                                           values if n == room else np.ascontiguousarray(values[:, :n])))
 

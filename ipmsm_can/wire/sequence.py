@@ -14,6 +14,10 @@ What can happen, and what is done:
     wraps guessed wrong         put right by DriveTiming, filters restart          (resync)
     drive restarted             counter jumps back or far ahead: everything anew   (restart)
 
+A drive that measures its sample rate never states the same one twice: statements within RATE_TOLERANCE of the
+rate in force are the same sampling and interrupt nothing.  The rate in force, which the estimator's coefficients
+hang on, stays; the latest statement paces the guesses from arrival times, which would run away from it.
+
 Everything is counted.  Samples that arrive before the sample rate is known wait (see `SampleSequencer`).
 """
 
@@ -30,9 +34,16 @@ from ipmsm_can._jit import kernel
 
 NIBBLE, TIMING, FULL = range(3)
 """Kinds of event: sample with a 4-bit counter, DriveTiming, sample with a 32-bit counter."""
+CLIPPED = 4
+"""Added to the kind of a sample that was cut off at the end of its range; also the bit in `SampleRun.doubt`."""
+_KIND = 3
 
 RATE_MIN, RATE_MAX = 100.0, 100_000.0
 """Sample rates [Hz] that are believed."""
+RATE_TOLERANCE = 1e-3
+"""Statements of the sample rate this close to each other, relatively, are one.  Quartz is 1e-4 off at most, and
+counting a period's worth of ticks adds as much; a converter that is switched to another rate makes a larger step.
+The estimator can stand it: speed and flux come out wrong by as much, less than psi_m is ever known to."""
 RESTARTED = 1 << 40
 """Value of `gap` at the first sample after the drive restarted: nothing before it counts."""
 LONGEST_SILENCE = 60.0
@@ -55,13 +66,14 @@ Ints = NDArray[np.int64]
 
 STATE = np.dtype([
     ("has_last", "i8"), ("last", "i8"), ("last_t", "i8"), ("has_floor", "i8"), ("floor", "i8"),
-    ("rate", "f8"), ("synced", "i8"), ("guess", "i8"), ("offset", "i8"), ("restarted", "i8"),
+    ("rate", "f8"), ("pace", "f8"), ("synced", "i8"), ("guess", "i8"), ("offset", "i8"), ("restarted", "i8"),
     ("correction", "i8"), ("doubt", "i8"), ("doubted_t", "i8"), ("seen", "u8"), ("values", "f8", (4,)),
 ])
 
-RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW = range(10)
+(RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW,
+ CLIPPED_SAMPLES) = range(11)
 COUNTERS = ("received", "filled", "lost", "duplicates", "reordered", "gaps", "resyncs", "restarts",
-            "bad_rate", "overflow")
+            "bad_rate", "overflow", "clipped")
 
 SEQUENCED, _RATE_CHANGED = range(2)
 """Why `sequence` stopped: at the end, or for another sample rate."""
@@ -73,8 +85,9 @@ _WRAP = 1 << 32
 class Events:
     """Sample and timing frames of one drive in order of arrival, N events.
 
-    kind (N,) int64: NIBBLE, TIMING or FULL.  counter (N,) int64: 4 or 32 bits.  rate (N,) float64 [Hz], for
-    TIMING.  t_ns (N,) int64 arrival time [ns].  values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
+    kind (N,) int64: NIBBLE, TIMING or FULL; CLIPPED is added to that of a sample which was cut off.
+    counter (N,) int64: 4 or 32 bits.  rate (N,) float64 [Hz], for TIMING.  t_ns (N,) int64 arrival time [ns].
+    values (4, N): i_alpha, i_beta [A], v_alpha, v_beta [V].
     """
 
     kind: Ints
@@ -108,7 +121,8 @@ class SampleRun:
     none, RESTARTED after a restart of the drive; negative where the samples before it turn out to have been
     dated wrong, by so many samples).
     doubt (M,) uint8: 1 while the counter, so the time, may be wrong by whole wraps: after a silence that could be
-    loss or lateness, until DriveTiming or the pace of arrival settles it.
+    loss or lateness, until DriveTiming or the pace of arrival settles it.  CLIPPED is added where the sample, or
+    the one that a filled one leads to, was cut off at the end of its range.
     t_ns (M,) int64: arrival of the frame (filled: of the frame that closed the gap).
     """
 
@@ -131,7 +145,7 @@ def _steps_since_last(nibble: int, t_ns: int, st: Any) -> int:
     if st.rate <= 0.0:
         return int(delta if delta <= 8 else delta - 16)
     # A clock that was set back says nothing; believed, it would make every sample that follows "late".
-    expected = min(max((t_ns - st.last_t) * 1e-9 * st.rate, 0.0), 1e9)
+    expected = min(max((t_ns - st.last_t) * 1e-9 * st.pace, 0.0), 1e9)
     if delta == 1 and least <= 1 and expected <= LATE_AT_MOST * st.rate:
         # Exactly the next one: late rather than exactly 16, 32, ... lost.
         if expected - delta > HALF_WRAP:
@@ -160,9 +174,14 @@ def _settled(last: int, sent: int) -> int:
 
 @kernel
 def _timing(counter: int, rate: float, st: Any, counts: Ints) -> bool:
-    """Take in a DriveTiming; True where the sample rate changed."""
-    changed = rate != st.rate
-    st.rate = rate
+    """Take in a DriveTiming; True where the sample rate changed, by more than RATE_TOLERANCE."""
+    changed = abs(rate - st.rate) > RATE_TOLERANCE * st.rate
+    if changed:
+        st.rate = rate
+    elif st.has_last:
+        # The earliest arrival is kept as of sample 0; as of the last one it stays what it was.
+        st.offset += int(st.last * (1e9 / st.pace) - st.last * (1e9 / rate))
+    st.pace = rate
     synced = st.synced
     st.synced = 1
     st.guess = 0
@@ -206,7 +225,7 @@ def _before_it_was_taken(t_ns: int, st: Any, counts: Ints) -> None:
     """Put right a guess after which samples arrive earlier than any before them, by half a wrap or more; without
     DriveTiming, also one after which they stay late.
     """
-    period = 1e9 / st.rate
+    period = 1e9 / st.pace
     offset = t_ns - int(st.last * period)
     early = (st.offset - offset) / period
     if st.guess > 0 and early > HALF_WRAP:
@@ -255,8 +274,10 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                 return m, k + 1, _RATE_CHANGED
             k += 1
             continue
+        whole = kind[k] & _KIND == FULL
+        clipped = kind[k] & CLIPPED
         if st.has_last:
-            if kind[k] == NIBBLE:
+            if not whole:
                 steps = _steps_since_last(counter[k], t_ns[k], st)
             else:
                 st.doubt = 0
@@ -281,11 +302,11 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.last += steps
             st.seen = (st.seen << np.uint64(steps)) | np.uint64(1) if steps < 64 else np.uint64(1)
             counts[LOST] += missing
-            if kind[k] == NIBBLE and st.rate > 0.0:
+            if not whole and st.rate > 0.0:
                 _before_it_was_taken(t_ns[k], st, counts)
         else:
             st.seen = np.uint64(1)
-            if kind[k] == FULL:
+            if whole:
                 st.last = counter[k]
                 st.synced = 1
             else:
@@ -293,7 +314,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                 st.last = floor + ((counter[k] - floor) & 15)
             st.guess = 0
             st.doubt = 0
-            st.offset = t_ns[k] - int(st.last * (1e9 / st.rate)) if st.rate > 0.0 else 0
+            st.offset = t_ns[k] - int(st.last * (1e9 / st.pace)) if st.rate > 0.0 else 0
         gap = 0
         if st.restarted or not st.has_last:
             gap = RESTARTED if st.restarted else 0
@@ -309,7 +330,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
                     out_values[r, m] = st.values[r] + weight * (values[r, k] - st.values[r])
                 out_counter[m] = (st.last - missing - 1 + j) & (_WRAP - 1)
                 out_filled[m] = 1
-                out_doubt[m] = st.doubt
+                out_doubt[m] = st.doubt | clipped
                 out_gap[m] = 0
                 out_t[m] = t_ns[k]
                 m += 1
@@ -319,11 +340,12 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
             st.values[r] = values[r, k]
         out_counter[m] = st.last & (_WRAP - 1)
         out_filled[m] = 0
-        out_doubt[m] = st.doubt
+        out_doubt[m] = st.doubt | clipped
         out_gap[m] = gap
         out_t[m] = t_ns[k]
         m += 1
         counts[RECEIVED] += 1
+        counts[CLIPPED_SAMPLES] += 1 if clipped else 0
         st.has_last = 1
         st.restarted = 0
         st.correction = 0
@@ -336,8 +358,8 @@ class SampleSequencer:
     """Sequencing of one drive's samples, with its state and counters.
 
     max_gap: longest loss, in samples, that is filled by interpolation, 0..64.
-    sample_rate: [Hz], used where the drive sends no DriveTiming; None: samples wait for the first one, at most
-    PENDING_MAX of them, and then get the right 32-bit counters in hindsight.
+    sample_rate: [Hz], used where the drive sends no DriveTiming, or states nearly the same there; None: samples
+    wait for the first one, at most PENDING_MAX of them, and then get the right 32-bit counters in hindsight.
     """
 
     def __init__(self, max_gap: int, sample_rate: float | None = None) -> None:
@@ -371,7 +393,7 @@ class SampleSequencer:
         if not len(events):
             return []
         if self.sample_rate == 0.0 and self._fallback_rate is not None:
-            self._state["rate"] = self._fallback_rate
+            self._state["rate"] = self._state["pace"] = self._fallback_rate
         if self.sample_rate == 0.0:
             events = self._believed(events)
             self._pending.append(events)
@@ -406,14 +428,14 @@ class SampleSequencer:
 
     def _synchronise(self, events: Events, timing: int) -> None:
         """Give the samples before the first DriveTiming the counters they must have had."""
-        self._state["rate"] = events.rate[timing]
-        kinds = events.kind[:timing]
+        self._state["rate"] = self._state["pace"] = events.rate[timing]
+        kinds = events.kind[:timing] & _KIND
         nibbles = np.flatnonzero(kinds == NIBBLE)
         if not nibbles.size or (kinds == FULL).any():
             return
         before = events.take(slice(0, timing))
         trial = SampleSequencer(0)
-        trial._state["rate"] = self._state["rate"]
+        trial._state["rate"] = trial._state["pace"] = self._state["rate"]
         runs = trial._run(before)
         if not runs:
             return

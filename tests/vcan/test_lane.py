@@ -17,6 +17,7 @@ from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, constant
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
+from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.node import Tracked
@@ -90,7 +91,7 @@ def joined(tracked: list[Tracked], name: str) -> np.ndarray:
     return np.concatenate([getattr(t.estimate, name) for t in tracked], axis=-1)
 
 
-@pytest.mark.parametrize("kind", ["clean", "loss", "reference", "garbage"])
+@pytest.mark.parametrize("kind", ["clean", "loss", "reference", "garbage", "cut off"])
 def test_same_bits_as_the_ordinary_path(kind: str) -> None:
     frames = traffic(1.5, 500.0 if kind == "reference" else 0.0)
     if kind == "loss":
@@ -102,6 +103,9 @@ def test_same_bits_as_the_ordinary_path(kind: str) -> None:
         places = np.sort(np.random.default_rng(3).integers(1000, len(frames), 40))
         order = np.argsort(np.concatenate([np.arange(len(frames)), places - 0.5]), kind="stable")
         frames = FrameBlock.concat([frames, odd]).take(order)
+    if kind == "cut off":
+        for at in np.flatnonzero(frames.can_id == 0x100)[[2000, 2001, 2003]]:
+            frames.raw[at, 8:10] = 0xFF, 0x3F  # i_alpha: the largest of 15 bits
     blocks, tracked, runner, heard, sent = serve(frames, 0.0005)
     received = FrameBlock.concat(blocks)
     assert np.array_equal(received.raw[:, :16], frames.raw[:, :16])
@@ -112,6 +116,10 @@ def test_same_bits_as_the_ordinary_path(kind: str) -> None:
                           np.concatenate([t.run.counter for t in expected]))
     for name in FIELDS:
         assert np.array_equal(joined(tracked, name), joined(expected, name)), name
+    if kind == "cut off":
+        valid = joined(tracked, "flags") & confidence.VALID != 0
+        assert valid[1900:2000].all() and not valid[2000:2003 + 1250].any() and valid[-1]
+        assert runner.companion.nodes[0].receiver.sequencer.count("clipped") == 3
     node, twin = runner.companion.nodes[0], companion.nodes[0]
     assert node.receiver.sequencer.counts.tolist() == twin.receiver.sequencer.counts.tolist()
     assert runner.companion.counts.by_kind.tolist() == companion.counts.by_kind.tolist()
