@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +25,8 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).resolve().parent
 _CACHES_KEPT = 4
+_UNUSED_S = 30 * 86400.0
+"""A cache folder that no process began to use for so long may go; a younger one may still be written to."""
 
 
 def _kernel_digest() -> str:
@@ -52,7 +55,8 @@ def _select_cache() -> None:
         os.utime(folder)
         older = sorted(root.glob("kernels-*"), key=lambda p: p.stat().st_mtime)[:-_CACHES_KEPT]
         for path in older:
-            shutil.rmtree(path, ignore_errors=True)
+            if time.time() - path.stat().st_mtime > _UNUSED_S:
+                shutil.rmtree(path, ignore_errors=True)
     except OSError:
         return  # a read-only home: numba then falls back to __pycache__ or a folder of its own
     numba.config.CACHE_DIR = str(folder)
