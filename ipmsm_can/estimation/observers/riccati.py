@@ -23,9 +23,9 @@ Loss of lock.  The squared innovation over its variance and that of the length o
 whichever is larger, averaged over INNOVATION_TIME; beyond _LOST_ABOVE everything is forgotten but the flux itself.
 
 Polarity.  Standstill makes |Phi| = |L_0 H[i]| and the voltage error twice its size; only while Phi is longer than
-both together does a sample count for the polarity.  It is known once these samples alone, against all of the voltage
-error as noise, fix the flux in every direction to _POLARITY_SHARE of psi_m.  A turning rotor does that; a constant
-error of the voltage, whatever its size, points in one direction and does not.
+both together does a sample count for the polarity.  It is known once these samples alone, against all of the
+voltage error as noise, fix the flux in every direction to _POLARITY_SHARE of psi_m.  A turning rotor does that; a
+constant error of the voltage, whatever its size, points in one direction and does not.
 
 Not quoted from the paper, which leaves the gain to the user.
 """
@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers.common import BIASES, FITS, FLUX_STATES, POLARITY, along
-from ipmsm_can.estimation.observers.voltage_errors import directions, predict
+from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, predict
 
 Floats = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def _gradient(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) ->
 def _across(P: Floats, x_a: float, x_b: float) -> float:
     """Variance of the flux [Wb^2] across x."""
     across = x_b * x_b * P[0, 0] - 2.0 * x_a * x_b * P[0, 1] + x_a * x_a * P[1, 1]
-    return max(across, 0.0) / (x_a * x_a + x_b * x_b)
+    return float(max(across, 0.0) / (x_a * x_a + x_b * x_b))
 
 
 @kernel
@@ -179,7 +179,7 @@ def _count_clear(phi_a: float, phi_b: float, noise: float, process: float, ceili
     st.clear[0] = aa
     st.clear[1] = ab
     st.clear[2] = bb
-    return 0.5 * (aa + bb) + math.sqrt(0.25 * (aa - bb) ** 2 + ab * ab)
+    return float(0.5 * (aa + bb) + math.sqrt(0.25 * (aa - bb) ** 2 + ab * ab))
 
 
 @kernel

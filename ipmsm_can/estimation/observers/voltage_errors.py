@@ -1,7 +1,7 @@
 """What may be wrong with the reported voltage, as signals that `riccati` can weigh: four states and their priors.
 
     v_true = v_reported + sum over j of b_j B_j(t)
-    B_0, B_1   the alpha and the beta axis: a lasting offset b [V], of the voltage or, through R, of a current sensor
+    B_0, B_1   the alpha and the beta axis: a lasting offset b [V] of the voltage or, through R, of a sensor
     B_2        against the current, phase by phase: dead time, b [V] lost by each phase.  It stands still in the
                rotor's frame for a whole half-period of each phase, so it is no noise: it is one unknown number
     B_3        -i: an error b [ohm] of the resistance
