@@ -57,7 +57,7 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
     regression: float64 (7, N) from `regression_block`.
     parameters, state: record arrays (1,) of `common`; `lambda_a/b` holds the initial flux before the first sample.
     out: float64 (7, N), six rows of it: lambda_hat [Wb], x_hat [Wb], innovation y - Phi^T x_hat - d_hat before the
-    correction [V Wb], and the total correction gain of the interval (1 - exp(-gamma |Phi|^2 T_s)) / |Phi|^2 [1/V^2].
+    correction [V Wb], and the total correction gain of the interval (1 - exp(-gamma |Phi|^2 T_s))/|Phi|^2 [1/V^2].
     """
     p = parameters[0]
     L_q = p.L_q
