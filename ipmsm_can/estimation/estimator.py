@@ -198,6 +198,15 @@ class Estimator:
             pll = self._speed
             turned = float(pll["omega"][0]) * elapsed
             angle = float(pll["theta"][0]) + turned
+            one_step_back, lag = angle - float(pll["omega"][0]) / self.sample_rate, 0.0
+            own = KINDS[s.kind] == RICCATI
+            if own and self._confidence["locked"][0]:
+                speed_before = float(pll["omega"][0])
+                angle, omega, lag = speed.carried(pll, elapsed)
+                turned = angle - float(pll["theta_hat"][0])
+                one_step_back = angle - omega / self.sample_rate
+                # The loop goes on with the lag that it had.
+                pll["omega"] = speed_before + omega - speed.carried(pll, 0.0)[1]
             size = self.motor.psi_m
             held = float(np.hypot(old["x_a"], old["x_b"]))
             if held > s.epsilon:
@@ -205,8 +214,8 @@ class Estimator:
             fresh = common.new_state(size * math.cos(angle) + self._assumed.L_q * float(first[0]),
                                      size * math.sin(angle) + self._assumed.L_q * float(first[1]), angle)
             fresh["known"] = old["known"]
-            one_step_back = angle - float(pll["omega"][0]) / self.sample_rate
-            pll["theta"] = pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
+            pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
+            pll["theta"] = math.remainder(one_step_back - lag, 2.0 * math.pi)
             if missing < 0:
                 # What was taken for one stretch of time was two, or the other way round.
                 doubt = size * min(abs(missing * float(pll["omega"][0])) / self.sample_rate, math.pi)
@@ -217,6 +226,6 @@ class Estimator:
             for name in ("pll_started", "pll_omega", "pll_difference"):
                 fresh[name] = old[name]
             fresh["pll_theta"] = fresh["pll_hat"] = pll["theta"]
-            if KINDS[s.kind] == RICCATI:
+            if own:
                 riccati.carry_over(self._observer, fresh, turned, doubt**2 + drift**2)
         self._observer = fresh
