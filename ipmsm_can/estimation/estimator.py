@@ -225,7 +225,9 @@ class Estimator:
             confidence.widen(self._confidence, doubt**2 + drift**2)
             for name in ("pll_started", "pll_omega", "pll_difference"):
                 fresh[name] = old[name]
-            fresh["pll_theta"] = fresh["pll_hat"] = pll["theta"]
+            fresh["pll_hat"] = pll["theta_hat"]
+            fresh["pll_theta"] = pll["theta"]
+            fresh["x_a"], fresh["x_b"] = old["x_a"], old["x_b"]
             if own:
                 riccati.carry_over(self._observer, fresh, turned, doubt**2 + drift**2)
         self._observer = fresh

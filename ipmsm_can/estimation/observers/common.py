@@ -33,10 +33,10 @@ PARAMETERS = np.dtype([
     ("mean", "f8"), ("difference", "f8"), ("noise", "f8"),
     # Probing signal: rad per sample, half its cotangent, samples in the window, filter coefficients.
     ("step", "f8"), ("half_cot", "f8"), ("window", "i8"), ("slow", "f8"), ("average", "f8"),
-    # ges: pole of the loop that gives the speed, and whether the gain follows it.
+    # ges and riccati: pole of the loop that gives the speed; ges: whether the gain follows it.
     ("pole", "f8"), ("scheduled", "i8"),
     # riccati: 1-sigma of what is uncertain [V], [ohm], share of L_q; states of the voltage's error.
-    ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
+    ("L_d", "f8"), ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
     ("spread_L", "f8"), ("zone", "f8"), ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
 ])
 
@@ -50,7 +50,7 @@ STATE = np.dtype([
     ("theta", "f8"), ("known", "i8"), ("phase", "f8"), ("count", "i8"), ("slot", "i8"),
     ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (8,)),
     ("sums", "c16", (7,)), ("fresh", "c16", (7,)), ("ring", "c16", (WINDOW_CAPACITY, 3)),
-    # ges with a scheduled gain: its own phase-locked loop, as `speed` has it.
+    # ges with a scheduled gain, and riccati: a phase-locked loop of their own, as `speed` has it.
     ("pll_started", "i8"), ("pll_hat", "f8"), ("pll_theta", "f8"), ("pll_omega", "f8"), ("pll_difference", "f8"),
     # riccati: covariance, voltage errors, what these put into the regression, and what it judges itself by.
     ("P", "f8", (FLUX_STATES, FLUX_STATES)), ("bias", "f8", (BIASES,)),
@@ -118,7 +118,8 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "step": step, "half_cot": 0.5 / math.tan(0.5 * step),
         "window": window_length(injection_frequency, sample_rate),
         "slow": -math.expm1(-step / 8.0), "average": -math.expm1(-step / (2.0 * math.pi * _FILTER_PERIODS)),
-        "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor), "volts": u.voltage,
+        "L_d": motor.L_d, "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor),
+        "volts": u.voltage,
         "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
         "prior": u.priors(motor), "keep": keeps(sample_rate),
     }

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
 from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, predict
+from ipmsm_can.estimation.speed import follow
 
 Floats = NDArray[np.float64]
 
@@ -233,7 +234,9 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             if P[0, 0] == 0.0:
                 _forget(P, st, p, ceiling)
         else:
-            directions(0.5 * (st.i_a + i_a), 0.5 * (st.i_b + i_b), p.zone, B)
+            # While the voltage is held the back-EMF turns: i'' = L^-1 omega^2 x bends the current below its ends' mean.
+            bend = (T_s * st.pll_omega) ** 2 / (12.0 * p.L_d)
+            directions(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.zone, B)
             l_a += regression[3, k]
             l_b += regression[4, k]
             for j in range(BIASES):
@@ -264,6 +267,10 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
                 st.product[j] = 0.0
                 st.f_product[j] = 0.0
             st.memory = correlated * (4.0 * alpha * psi_m * psi_m) ** 2
+            st.x_a = 0.0
+            st.x_b = 0.0
+            st.pll_omega = 0.0
+            st.pll_difference = 0.0
             out[0, k] = l_a
             out[1, k] = l_b
             out[2, k] = 0.0
@@ -336,6 +343,15 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         st.f_u_a = open_ua + p.present * u_a
         st.f_u_b = open_ub + p.present * u_b
 
+        st.x_a = x_a
+        st.x_b = x_b
+        angle = math.atan2(x_b, x_a)
+        st.pll_theta, st.pll_omega, st.pll_difference = follow(
+            angle, x2 < epsilon * epsilon, st.pll_started, st.pll_hat, st.pll_theta, st.pll_omega, st.pll_difference,
+            T_s, p.pole)
+        st.pll_started = 1
+        st.pll_hat = angle
+
         # What to think of it.
         sigma = math.pi
         if x2 > epsilon * epsilon:
@@ -375,6 +391,3 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         out[6, k] = FITS * fits + POLARITY * st.polarity
     st.lambda_a = l_a
     st.lambda_b = l_b
-    if samples.shape[1] > 0:
-        st.x_a = out[2, samples.shape[1] - 1]
-        st.x_b = out[3, samples.shape[1] - 1]
