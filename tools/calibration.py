@@ -1,10 +1,10 @@
 """Is the reported 1-sigma what the error is: `python -m tools.calibration [--kind riccati] [--draws 8] [--seed 1]`.
 
-Every experiment of the comparison, each draw with its own motor errors (R +-20 %, L_d and L_q +-10 %, psi_m +-5 %, all
-uniform: what the observer is told against what the machine is), current offsets (+-20 mA an axis), current noise
-0.02 A and dead time 0.5 V a phase.  Through the drive, the frames and the companion; errors against the simulated
-rotor.  The figures are over the samples that the companion calls valid; where it never does, as it does not know the
-polarity, over those it calls locked, and errors count modulo half a turn.
+Every experiment of the comparison, each draw with its own motor errors (R +-20 %, L_d and L_q +-10 %, psi_m +-5 %,
+all uniform: what the observer is told against what the machine is), current offsets (+-20 mA an axis), current
+noise 0.02 A, dead time 0.5 V a phase and initial angle.  Through the drive, the frames and the companion; errors
+against the simulated rotor.  The figures are over the samples that the companion calls valid; where it never does,
+as it does not know the polarity, over those it calls locked, and errors count modulo half a turn.
 
     within      share of the time in which |error| < 2 sigma
     too large   median over the draws of sigma (median of the run) over the error (rms of the run)
@@ -68,8 +68,8 @@ def draw(name: str, number: int, seed: int, kind: str) -> Outcome:
     sigma = np.degrees(track.sigma)
     judged = track.valid if track.valid.any() else track.locked
     inside = error[judged] < 2.0 * sigma[judged]
-    return Outcome(name, int(judged.sum()), int(inside.sum()), float(np.median(sigma[judged])) if judged.any() else 0.0,
-                   rms(error[judged]) if judged.any() else 0.0, float(error[track.valid].max(initial=0.0)),
+    sure, off = (float(np.median(sigma[judged])), rms(error[judged])) if judged.any() else (0.0, 0.0)
+    return Outcome(name, int(judged.sum()), int(inside.sum()), sure, off, float(error[track.valid].max(initial=0.0)),
                    float(track.valid.mean()))
 
 

@@ -1,7 +1,7 @@
 """What the Riccati-gain observer shows beside the paper's: `python -m tools.riccati`.
 
-Through the simulated drive and the wire, both observers on the same frames; errors are electrical degrees against the
-simulated rotor.  Exit code 1 when a line does not hold.
+Through the simulated drive and the wire, both observers on the same frames; errors are electrical degrees against
+the simulated rotor.  Exit code 1 when a line does not hold.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ANGLES = range(0, 360, 30)
 
 
 def lock() -> bool:
-    """Time until the error stays below 5 deg, from psi_m at every angle, at constant speed under a third of the load."""
+    """Time until the error stays below 5 deg, from psi_m at every angle, at constant speed and a third of the load."""
     print(f"lock to {LOCK_DEG:g} deg from 12 initial angles; 0.5 V dead time, 0.02 A noise")
     print(f"{'':14s} {'riccati, worst':>15s} {'times w':>9s} {'paper, median':>15s} {'sooner, least':>15s}")
     good = True
@@ -55,8 +55,8 @@ def lock() -> bool:
         holds = max(ours) * w <= 3.0 and sooner >= 5.0
         good &= holds
         median = f"{1e3 * float(np.median(paper)):.0f} ms" if math.isfinite(np.median(paper)) else "never"
-        print(f"{motor} {rpm:6.0f} rpm {1e3 * max(ours):12.1f} ms {max(ours) * w:9.2f} {median:>15s} {sooner:15.1f} "
-              f"  {'holds' if holds else 'FAILS'}", flush=True)
+        print(f"{motor} {rpm:6.0f} rpm {1e3 * max(ours):12.1f} ms {max(ours) * w:9.2f} {median:>15s} {sooner:15.1f}   "
+              f"{'holds' if holds else 'FAILS'}", flush=True)
     return good
 
 
@@ -76,7 +76,8 @@ def robustness() -> bool:
         ratios.append(values[0] / values[1])
         print(f"{scene.name:22s} {values[0]:9.3f} {values[1]:9.3f} {ratios[-1]:9.2f}", flush=True)
     holds = float(np.median(ratios)) >= 5.0 and min(ratios) >= 1.0
-    print(f"median {np.median(ratios):.1f} times smaller, least {min(ratios):.3f}   {'holds' if holds else 'FAILS'}")
+    print(f"median {np.median(ratios):.1f} times smaller, least {min(ratios):.3f}   "
+          f"{'holds' if holds else 'FAILS'}")
     return holds
 
 
@@ -85,11 +86,11 @@ def loss() -> bool:
     protocol = Protocol()
     good = True
     slow = constant(20.0 * RPM, 2.0, 3.0)
-    ramps = Profile(tuple((t, rpm * RPM) for t, rpm in (
-        (0.0, 100.0), (0.5, 100.0), (0.75, 1000.0), (1.2, 1000.0), (1.45, 100.0), (2.5, 100.0))), ((0.0, 1.0),), 2.5,
-        "100-1000-100 rpm")
+    points = ((0.0, 100.0), (0.5, 100.0), (0.75, 1000.0), (1.2, 1000.0), (1.45, 100.0), (2.5, 100.0))
+    ramps = Profile(tuple((t, rpm * RPM) for t, rpm in points), ((0.0, 1.0),), 2.5, "100-1000-100 rpm")
     print(f"lost frames {'':29s} {'rms deg':>9s} {'relock':>12s} {'bursts':>7s}")
-    for name, track in (("1000 rpm, torque pulses", torque_pulses()), ("100-1000-100 rpm", ramps), ("20 rpm", slow)):
+    tracks = {"1000 rpm, torque pulses": torque_pulses(), "100-1000-100 rpm": ramps, "20 rpm": slow}
+    for name, track in tracks.items():
         for words, faults in (("5 % loss", BusFaults(loss=0.05, seed=1)),
                               ("bursts of 50", BusFaults(burst=0.002, burst_length=50, seed=1)),
                               ("both", BusFaults(loss=0.05, burst=0.002, burst_length=50, seed=2))):
