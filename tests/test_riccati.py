@@ -1,4 +1,4 @@
-"""The Riccati-gain observer: its algebra against NumPy, its sigma against its errors, and what it does when lost."""
+"""The Riccati-gain observer: its algebra against NumPy, its sigma against its errors, what it does when lost."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ def riccati_on(samples: np.ndarray, motor: Motor, **keys: Any) -> tuple[Estimate
 
 def regressed(samples: np.ndarray, motor: Motor, alpha: float) -> np.ndarray:
     out = np.empty((regression.ROWS, samples.shape[1]))
-    regression.regression_block(samples, regression.parameters(motor, alpha, RATE), np.zeros(1, regression.STATE), out)
+    p = regression.parameters(motor, alpha, RATE)
+    regression.regression_block(samples, p, np.zeros(1, regression.STATE), out)
     return out
 
 
@@ -71,7 +72,7 @@ def test_correction_is_josephs(noise: float) -> None:
 
 
 def test_two_states_are_the_textbook_filter() -> None:
-    """Without saliency there is no d, without adaptation no voltage state: NumPy does the same from the equations."""
+    """Without saliency there is no d, without adaptation no voltage state: NumPy does the same."""
     n, alpha = 800, 100.0
     machine = Rotating(SURFACE, 120.0, 0.0, 2.0)
     rng = np.random.default_rng(3)
@@ -228,7 +229,8 @@ def test_locks_from_every_angle_within_three_over_w_and_five_times_sooner(motor:
     assert slowest[1] > 5.0 * slowest[0], slowest
 
 
-def jumped(motor: Motor, w: float, degrees: float, scale: float, n: int, until: int) -> tuple[np.ndarray, np.ndarray]:
+def jumped(motor: Motor, w: float, degrees: float, scale: float, n: int,
+           until: int) -> tuple[np.ndarray, np.ndarray]:
     """From n // 2 on the rotor stands `degrees` further; until `until` the reported voltage is scaled."""
     before, after = (Rotating(motor, w, 0.0, 1.0, 0.3 + math.radians(a)) for a in (0.0, degrees))
     samples, theta = before.samples(RATE, n), before.theta(np.arange(n) / RATE).copy()
@@ -297,8 +299,9 @@ def test_a_burst_in_a_speed_ramp_is_carried_over() -> None:
     out = Estimator(M2, RATE, settings("riccati", M2)).process(np.ascontiguousarray(samples[:, keep]), gap[keep])
     off = degrees_between(out.angle[0], s.theta_e[keep])
     at = np.flatnonzero(gap[keep])
-    assert np.abs(off[1000:]).max() < 5.0
-    assert np.abs(off[at + 10]).max() < 1.0
+    # The second and the third lie in the ramp, whose 0.5 a t^2 is 6.5 deg in 10 ms.
+    assert np.abs(off[at]).max() < 1.0
+    assert np.abs(off[1000:]).max() < 1.0
     assert out.flags[-1] & VALID
 
 
@@ -321,6 +324,20 @@ def test_standstill_is_never_valid_whatever_the_voltage_is_wrong_by(volts: float
         for angle in (0.4, 1.97, 3.54):
             out, _ = riccati_on(samples, M2, initial_flux=[0.59 * math.cos(angle), 0.59 * math.sin(angle)])
             assert not (out.flags & (VALID | POLARITY)).any()
+
+
+def test_a_current_that_turns_while_the_rotor_stands_is_no_rotor() -> None:
+    """The voltage error turns with it and looks like a weak magnet's back-EMF, from every direction in turn."""
+    n = 20_000
+    t = np.arange(n) / RATE
+    for hertz in (1.0, 5.0):
+        v = (M2.R * 2.0 + 0.6) * np.exp(2j * math.pi * hertz * t)
+        samples = locked_rotor(M2, 0.4, v, RATE)
+        i = samples[0] + 1j * samples[1]
+        reported = v - 0.6 * i / np.maximum(np.abs(i), 1e-3)
+        samples[2], samples[3] = reported.real, reported.imag
+        out, _ = riccati_on(samples, M2)
+        assert not (out.flags & (VALID | POLARITY)).any()
 
 
 @given(seed=st.integers(0, 2**32 - 1), scale=st.sampled_from([1e-300, 1e-6, 1.0, 1e4, 1e30, 1e150, 1e308]),
@@ -347,15 +364,15 @@ def test_any_samples_leave_a_covariance(seed: int, scale: float, uncertainty: fl
 # The scheduled gain of ges
 
 def test_the_scheduled_gain_is_the_fastest_at_every_speed() -> None:
-    """Both poles at -w: the flux error falls below 1 % within 10/w, where fixed gains of the paper need far longer."""
+    """Both poles at -w: the flux error falls below 1 % within 0.1 s + 12/w; the paper's gains need far longer."""
     for w in (8.0, 40.0, 300.0):
         machine = Rotating(M2, w, 0.0, 1.0)
         n = int(RATE * (0.3 + 30.0 / w))
         start = M2.psi_m * np.exp(1j * (0.3 + math.pi / 2))
         took = {}
         for gamma in ("scheduled", 50.0):
-            out = Estimator(M2, RATE, settings("ges", M2, alpha=20.0, gamma=gamma,
-                                               initial_flux=[start.real, start.imag])).process(machine.samples(RATE, n))
+            chosen = settings("ges", M2, alpha=20.0, gamma=gamma, initial_flux=[start.real, start.imag])
+            out = Estimator(M2, RATE, chosen).process(machine.samples(RATE, n))
             x = out.flux[2] + 1j * out.flux[3]
             wrong = np.flatnonzero(np.abs(x - machine.active_flux(np.arange(n) / RATE)) > 0.01 * M2.psi_m)
             took[gamma] = (wrong[-1] + 1) / RATE
@@ -379,9 +396,9 @@ def test_what_the_configuration_says_of_both() -> None:
     assert parse_config(m2 + 'kind = "riccati"\n').alpha == 100.0
     assert parse_config(m2).alpha == 10.0
     assert parse_config(m2 + 'kind = "riccati"\nalpha = 40\n').alpha == 40.0
-    with pytest.raises(ValueError, match="observer.gamma.*only ges has a schedule"):
+    with pytest.raises(ValueError, match=r"observer.gamma.*only ges has a schedule"):
         parse_config(m2 + 'kind = "riccati"\ngamma = "scheduled"\n')
-    with pytest.raises(ValueError, match='observer.gamma is "fast"; allowed is .*or "scheduled"'):
+    with pytest.raises(ValueError, match=r'observer.gamma is "fast"; allowed is .*or "scheduled"'):
         parse_config(m2 + 'gamma = "fast"\n')
-    with pytest.raises(ValueError, match="observer.resistance_uncertainty is 120"):
+    with pytest.raises(ValueError, match=r"observer.resistance_uncertainty is 120"):
         parse_config(m2 + "resistance_uncertainty = 120\n")

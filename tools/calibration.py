@@ -69,8 +69,8 @@ def draw(name: str, number: int, seed: int, kind: str) -> Outcome:
     judged = track.valid if track.valid.any() else track.locked
     inside = error[judged] < 2.0 * sigma[judged]
     sure, off = (float(np.median(sigma[judged])), rms(error[judged])) if judged.any() else (0.0, 0.0)
-    return Outcome(name, int(judged.sum()), int(inside.sum()), sure, off, float(error[track.valid].max(initial=0.0)),
-                   float(track.valid.mean()))
+    return Outcome(name, int(judged.sum()), int(inside.sum()), sure, off,
+                   float(error[track.valid].max(initial=0.0)), float(track.valid.mean()))
 
 
 def _line(name: str, outcomes: list[Outcome]) -> tuple[float, float]:

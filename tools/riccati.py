@@ -34,7 +34,7 @@ ANGLES = range(0, 360, 30)
 
 
 def lock() -> bool:
-    """Time until the error stays below 5 deg, from psi_m at every angle, at constant speed and a third of the load."""
+    """Time until the error stays below 5 deg, from psi_m at every angle, at constant speed and some load."""
     print(f"lock to {LOCK_DEG:g} deg from 12 initial angles; 0.5 V dead time, 0.02 A noise")
     print(f"{'':14s} {'riccati, worst':>15s} {'times w':>9s} {'paper, median':>15s} {'sooner, least':>15s}")
     good = True
@@ -55,8 +55,8 @@ def lock() -> bool:
         holds = max(ours) * w <= 3.0 and sooner >= 5.0
         good &= holds
         median = f"{1e3 * float(np.median(paper)):.0f} ms" if math.isfinite(np.median(paper)) else "never"
-        print(f"{motor} {rpm:6.0f} rpm {1e3 * max(ours):12.1f} ms {max(ours) * w:9.2f} {median:>15s} {sooner:15.1f}   "
-              f"{'holds' if holds else 'FAILS'}", flush=True)
+        print(f"{motor} {rpm:6.0f} rpm {1e3 * max(ours):12.1f} ms {max(ours) * w:9.2f} {median:>15s} {sooner:15.1f}"
+              f"   {'holds' if holds else 'FAILS'}", flush=True)
     return good
 
 

@@ -45,11 +45,11 @@ def pole(bandwidth: float, sample_rate: float) -> float:
 
 
 def carried(state: NDArray[np.void], elapsed: float) -> tuple[float, float, float]:
-    """Where the rotor is after `elapsed` [s] without samples, for an observer's angle that is better than the loop's.
+    """Where the rotor is after `elapsed` [s] without samples, for an observer's angle better than the loop's.
 
-    state: record array (1,) of STATE.  Returns the angle [rad electrical], the speed there [rad/s electrical] and the
-    loop's lag [rad].  In a speed ramp a the loop, of natural frequency w, lags by e = a/w^2 in angle and 2 a/w in
-    speed; so its error says what the acceleration is.  The lag left after a correction is pole^2 e.
+    state: record array (1,) of STATE.  Returns the angle [rad electrical], the speed there [rad/s electrical] and
+    the loop's lag [rad].  In a speed ramp a the loop, of natural frequency w, lags by e = a/w^2 in angle and 2 a/w
+    in speed; so its error says what the acceleration is.  The lag left after a correction is pole^2 e.
     """
     st = state[0]
     T_s, pole_ = float(st["T_s"]), float(st["pole"])

@@ -46,8 +46,8 @@ class Track:
     """A run as the companion saw it; arrays (N,) over samples unless said otherwise.
 
     run.  time [s].  i, v: complex current [A peak] and mean voltage [V peak] as decoded.  theta: observer's angle
-    [rad electrical].  x, phi: complex active flux [Wb] and regressor [V].  excitation [V^2 s].  sigma: 1-sigma of theta [rad
-    electrical].  locked, valid: bool.
+    [rad electrical].  x, phi: complex active flux [Wb] and regressor [V].  excitation [V^2 s].  sigma: 1-sigma of
+    theta [rad electrical].  locked, valid: bool.
     truth: the drive's own values at these samples.
     reference_time [s], error [deg electrical]: estimate minus encoder where the encoder spoke, or minus the
     simulated rotor at every sample, as Setup.against_encoder says.

@@ -234,7 +234,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             if P[0, 0] == 0.0:
                 _forget(P, st, p, ceiling)
         else:
-            # While the voltage is held the back-EMF turns: i'' = L^-1 omega^2 x bends the current below its ends' mean.
+            # While the voltage is held the back-EMF turns: i'' = L^-1 omega^2 x bends the current away.
             bend = (T_s * st.pll_omega) ** 2 / (12.0 * p.L_d)
             directions(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.zone, B)
             l_a += regression[3, k]
@@ -347,8 +347,8 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         st.x_b = x_b
         angle = math.atan2(x_b, x_a)
         st.pll_theta, st.pll_omega, st.pll_difference = follow(
-            angle, x2 < epsilon * epsilon, st.pll_started, st.pll_hat, st.pll_theta, st.pll_omega, st.pll_difference,
-            T_s, p.pole)
+            angle, x2 < epsilon * epsilon, st.pll_started, st.pll_hat, st.pll_theta, st.pll_omega,
+            st.pll_difference, T_s, p.pole)
         st.pll_started = 1
         st.pll_hat = angle
 
