@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from ipmsm_can.bus.cosim import BusFaults
 from ipmsm_can.drive.parameters import DriveParameters
 from ipmsm_can.drive.profile import RPM, Profile, constant, torque_pulses
+from ipmsm_can.estimation.confidence import LOCKED
 from ipmsm_can.experiments.compare import SCENES, cost_per_sample
 from ipmsm_can.experiments.measure import LOCK_DEG, lock_time, rms
 from ipmsm_can.experiments.model import Run, Setup, Watcher
 from ipmsm_can.experiments.rig import observe
 from ipmsm_can.motor import PRESETS
 from ipmsm_can.wire.protocol import Protocol
-from tools.acceptance import Case
-from tools.acceptance import run as run_case
+from tools.acceptance import Case, run_with_flags
 
 Floats = NDArray[np.float64]
 
@@ -96,10 +96,10 @@ def loss() -> bool:
                               ("both", BusFaults(loss=0.05, burst=0.002, burst_length=50, seed=2))):
             case = Case(name, "m2", {"kind": "riccati"}, track, faults,
                         drive={"dead_time_voltage": 0.5, "current_noise": 0.02})
-            t, error, _ = run_case(case, protocol)
+            t, error, _, flags = run_with_flags(case, protocol)
             since = 0.5
             ends = t[1:][np.diff(t) > 0.005]
-            back = [_back(t, error, end) for end in ends if end > since]
+            back = [_back(t, error, flags, end) for end in ends if end > since]
             value, slowest = rms(error[t > since]), max(back, default=0.0)
             holds = value < 0.5 and slowest <= 0.02
             good &= holds
@@ -108,10 +108,16 @@ def loss() -> bool:
     return good
 
 
-def _back(t: Floats, error: Floats, end: float) -> float:
-    """Time [s] after a burst's end after which |error| stays below 5 deg for 50 ms."""
+def _back(t: Floats, error: Floats, flags: NDArray[np.uint8], end: float) -> float:
+    """Time [s] after a burst's end after which the angle is called locked and is within 5 deg for 50 ms.
+
+    Or until the next burst.
+    """
     inside = (t >= end) & (t < end + 0.05)
-    outside = np.flatnonzero(np.abs(error[inside]) >= LOCK_DEG)
+    later = np.flatnonzero(np.diff(t[inside]) > 0.005)
+    if later.size:
+        inside &= t <= t[inside][later[0]]
+    outside = np.flatnonzero((np.abs(error[inside]) >= LOCK_DEG) | (flags[inside] & LOCKED == 0))
     return float(t[inside][outside[-1]] - end) if outside.size else 0.0
 
 
