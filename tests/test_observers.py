@@ -145,7 +145,7 @@ def test_tracks_its_machine(kind: str, motor: Motor, w: float) -> None:
     assert out.angle[2, -1] == pytest.approx(w, rel=1e-3)
     assert out.flags[-1] & confidence.VALID
     assert np.abs(out.flux[0, -1] + 1j * out.flux[1, -1]) == pytest.approx(
-        abs(complex(machine.flux(0.0))), rel=1e-3)
+        abs(complex(machine.flux(0.0))), rel=3e-3 if kind == "riccati" else 1e-3)
 
 
 @pytest.mark.parametrize("kind", SPMSM)
