@@ -34,6 +34,7 @@ EXPONENTS = [
     (units.GRADIENT_GAIN, {"1/(V^2 s)": 0}),
     (units.NEWTON_METRE, {"mN m": -3, "N m": 0, "Nm": 0}),
     (units.FRICTION, {"mN m s": -3, "N m s": 0}),
+    (units.PERCENT, {"%": 0}),
     (units.INERTIA, {"kg m^2": 0, "kg cm^2": -4, "g cm^2": -7}),
 ]
 CASES = [(unit, spelling, exponent) for unit, table in EXPONENTS for spelling, exponent in table.items()]

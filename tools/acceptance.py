@@ -42,6 +42,11 @@ class Case:
 
 def run(case: Case, protocol: Protocol) -> tuple[Floats, Floats, Companion]:
     """(time of each sample [s], angle error [deg electrical], the companion afterwards)."""
+    return run_with_flags(case, protocol)[:3]
+
+
+def run_with_flags(case: Case, protocol: Protocol) -> tuple[Floats, Floats, Companion, NDArray[np.uint8]]:
+    """What `run` gives, and the flags of each sample (bits of `estimation.confidence`)."""
     parameters = DriveParameters(sample_rate=case.rate, **case.drive)
     simulation = DriveSimulation(PRESETS[case.motor], parameters, case.track)
     config = config_from({"motor": {"preset": case.motor}, "observer": case.observer,
@@ -54,7 +59,8 @@ def run(case: Case, protocol: Protocol) -> tuple[Floats, Floats, Companion]:
     counter = np.concatenate([t.run.counter for t in recording.tracked[0]])
     theta = np.concatenate([t.estimate.angle[0] for t in recording.tracked[0]])
     error = np.degrees((theta - truth[counter] + np.pi) % (2.0 * np.pi) - np.pi)
-    return counter / case.rate, error, companion
+    flags = np.concatenate([t.estimate.flags for t in recording.tracked[0]])
+    return counter / case.rate, error, companion, flags
 
 
 def rms(x: Floats) -> float:

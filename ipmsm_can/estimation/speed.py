@@ -35,14 +35,53 @@ def new_state(bandwidth: float, epsilon: float, sample_rate: float) -> NDArray[n
     state = np.zeros(1, STATE)
     state["T_s"] = 1.0 / sample_rate
     state["epsilon2"] = epsilon**2
-    state["pole"] = math.exp(-_TWO_PI * bandwidth / sample_rate)
+    state["pole"] = pole(bandwidth, sample_rate)
     return state
+
+
+def pole(bandwidth: float, sample_rate: float) -> float:
+    """The loop's double pole; bandwidth, sample_rate [Hz]."""
+    return math.exp(-_TWO_PI * bandwidth / sample_rate)
+
+
+def carried(state: NDArray[np.void], elapsed: float) -> tuple[float, float, float]:
+    """Where the rotor is after `elapsed` [s] without samples, for an observer's angle better than the loop's.
+
+    state: record array (1,) of STATE.  Returns the angle [rad electrical], the speed there [rad/s electrical] and
+    the loop's lag [rad].  In a speed ramp a the loop, of natural frequency w, lags by e = a/w^2 in angle and 2 a/w
+    in speed; so its error says what the acceleration is.  The lag left after a correction is pole^2 e.
+    """
+    st = state[0]
+    T_s, pole_ = float(st["T_s"]), float(st["pole"])
+    lag = math.remainder(float(st["theta_hat"]) - float(st["theta"]), _TWO_PI)
+    error = lag / pole_**2
+    acceleration = ((1.0 - pole_) / T_s) ** 2 * error
+    omega = float(st["omega"]) + (1.0 - pole_ * pole_) / T_s * error
+    angle = float(st["theta_hat"]) + omega * elapsed + 0.5 * acceleration * elapsed**2
+    return angle, omega + acceleration * elapsed, lag
 
 
 @kernel
 def wrap(angle: float) -> float:
     """The angle [rad] brought into [-pi, pi)."""
     return angle - _TWO_PI * math.floor((angle + math.pi) / _TWO_PI)
+
+
+@kernel
+def follow(new: float, rests: bool, started: int, theta_hat: float, theta: float, omega: float,
+           omega_difference: float, T_s: float, pole: float) -> tuple[float, float, float]:
+    """One step of the loop to the angle `new`: (theta, omega, omega_difference); rests: x_hat has no direction."""
+    if rests:
+        return new, 0.0, 0.0
+    if not started:
+        return new, omega, omega_difference
+    omega_difference += (1.0 - pole) * (wrap(new - theta_hat) / T_s - omega_difference)
+    theta += omega * T_s
+    error = wrap(new - theta)
+    if abs(error) > SLIP:
+        return new, omega_difference, omega_difference
+    return (wrap(theta + (1.0 - pole * pole) * error), omega + (1.0 - pole) * (1.0 - pole) / T_s * error,
+            omega_difference)
 
 
 @kernel
@@ -55,8 +94,6 @@ def speed_block(flux: NDArray[np.float64], state: NDArray[np.void], out: NDArray
     st = state[0]
     T_s = st.T_s
     pole = st.pole
-    angle_gain = 1.0 - pole * pole
-    speed_gain = (1.0 - pole) * (1.0 - pole) / T_s
     theta_hat = st.theta_hat
     theta = st.theta
     omega = st.omega
@@ -66,25 +103,9 @@ def speed_block(flux: NDArray[np.float64], state: NDArray[np.void], out: NDArray
         x_a = flux[2, k]
         x_b = flux[3, k]
         new = math.atan2(x_b, x_a)
-        if x_a * x_a + x_b * x_b < st.epsilon2:
-            started = 1
-            theta = new
-            omega = 0.0
-            omega_difference = 0.0
-        elif started:
-            step = wrap(new - theta_hat) / T_s
-            omega_difference += (1.0 - pole) * (step - omega_difference)
-            theta += omega * T_s
-            error = wrap(new - theta)
-            if abs(error) > SLIP:
-                theta = new
-                omega = omega_difference
-            else:
-                theta = wrap(theta + angle_gain * error)
-                omega += speed_gain * error
-        else:
-            started = 1
-            theta = new
+        theta, omega, omega_difference = follow(new, x_a * x_a + x_b * x_b < st.epsilon2, started, theta_hat, theta,
+                                                omega, omega_difference, T_s, pole)
+        started = 1
         theta_hat = new
         out[0, k] = theta_hat
         out[1, k] = theta

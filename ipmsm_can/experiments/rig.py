@@ -46,7 +46,8 @@ class Track:
     """A run as the companion saw it; arrays (N,) over samples unless said otherwise.
 
     run.  time [s].  i, v: complex current [A peak] and mean voltage [V peak] as decoded.  theta: observer's angle
-    [rad electrical].  x, phi: complex active flux [Wb] and regressor [V].  excitation [V^2 s].  valid: bool.
+    [rad electrical].  x, phi: complex active flux [Wb] and regressor [V].  excitation [V^2 s].  sigma: 1-sigma of
+    theta [rad electrical].  locked, valid: bool.
     truth: the drive's own values at these samples.
     reference_time [s], error [deg electrical]: estimate minus encoder where the encoder spoke, or minus the
     simulated rotor at every sample, as Setup.against_encoder says.
@@ -60,6 +61,8 @@ class Track:
     x: NDArray[np.complex128]
     phi: NDArray[np.complex128]
     excitation: Floats
+    sigma: Floats
+    locked: NDArray[np.bool_]
     valid: NDArray[np.bool_]
     truth: DriveSamples
     reference_time: Floats
@@ -87,8 +90,10 @@ def companion_config(setup: Setup, watcher: Watcher, probing: Probing | None = N
     motor: dict[str, Any] = {key: getattr(setup.machine, key) for key in _MOTOR_KEYS}
     for name, factor in watcher.scale:
         motor[name] *= factor
-    observer: dict[str, Any] = {"kind": watcher.kind, "alpha": watcher.alpha,
+    observer: dict[str, Any] = {"kind": watcher.kind,
                                 "initial_flux": watcher.start or _flux_near(setup, watcher.start_off)}
+    if watcher.alpha is not None:
+        observer["alpha"] = watcher.alpha
     if watcher.gamma is not None:
         observer["gamma"] = watcher.gamma
     injection: dict[str, Any] = {"enabled": False}
@@ -150,7 +155,9 @@ def observe(run: Run) -> Track:
         run=run, time=counter / run.setup.drive.sample_rate, i=values[0] + 1j * values[1],
         v=values[2] + 1j * values[3], theta=theta, x=flux[ges.X_A] + 1j * flux[ges.X_B],
         phi=regressed[regression.PHI_A] + 1j * regressed[regression.PHI_B],
-        excitation=np.concatenate([p.estimate.excitation for p in parts]), valid=flags & confidence.VALID != 0,
+        excitation=np.concatenate([p.estimate.excitation for p in parts]),
+        sigma=np.concatenate([p.estimate.sigma for p in parts]), locked=flags & confidence.LOCKED != 0,
+        valid=flags & confidence.VALID != 0,
         truth=truth, reference_time=at / run.setup.drive.sample_rate, error=wrapped_degrees(theta[at] - reference))
 
 
