@@ -221,8 +221,8 @@ def test_locks_from_every_angle_within_three_over_w_and_five_times_sooner(motor:
     for off in range(30, 360, 30):
         start = motor.psi_m * np.exp(1j * (0.3 + math.radians(off)))
         for which, (kind, keys) in enumerate((("riccati", {}), ("ges", gains))):
-            keys = {**keys, "initial_flux": [start.real, start.imag]}
-            out = Estimator(motor, RATE, settings(kind, motor, **keys)).process(samples)
+            chosen: dict[str, Any] = {**keys, "initial_flux": [start.real, start.imag]}
+            out = Estimator(motor, RATE, settings(kind, motor, **chosen)).process(samples)
             wrong = np.flatnonzero(np.abs(degrees_between(out.angle[0], machine.theta(np.arange(n) / RATE))) > 5.0)
             slowest[which] = max(slowest[which], (wrong[-1] + 1) / RATE if wrong.size else 0.0)
     assert slowest[0] < 3.0 / abs(w)
