@@ -26,7 +26,7 @@ from tests.rotating import Rotating, degrees_between
 RATE = 5000.0
 SURFACE = replace(M2, L_d=M2.L_s, L_q=M2.L_s, name="surface")
 SPMSM = ["spmsm_gradient", "spmsm_gradient_max", "spmsm_regression"]
-FLUX = ["ges", *SPMSM, "active_flux_regression", "chonam"]
+FLUX = ["ges", "riccati", *SPMSM, "active_flux_regression", "chonam"]
 MODULO_PI = ["injection_extraction", "injection_demodulation"]
 
 
@@ -121,7 +121,7 @@ def test_second_order_towards_its_differential_equation(kind: str, gamma: float,
     assert errors[0] / errors[-1] > 8**1.85, errors
 
 
-@pytest.mark.parametrize("kind", FLUX[1:])  # ges: tests/test_ges.py
+@pytest.mark.parametrize("kind", FLUX[2:])  # ges: tests/test_ges.py
 @pytest.mark.parametrize("gamma", [1e-3, 50.0, 1e6, 1e12])
 @pytest.mark.parametrize("alpha", [5.0, 200.0])
 @pytest.mark.parametrize("w", [0.5, 314.0])
@@ -136,7 +136,7 @@ def test_bounded_for_any_gain(kind: str, gamma: float, alpha: float, w: float) -
 @pytest.mark.parametrize("w", [60.0, -314.0])
 @pytest.mark.parametrize(("kind", "motor"), [
     *((kind, SURFACE) for kind in FLUX), *((kind, m) for m in (M1, M2) for kind in (
-        "ges", "active_flux_regression", "chonam"))], ids=str)
+        "ges", "riccati", "active_flux_regression", "chonam"))], ids=str)
 def test_tracks_its_machine(kind: str, motor: Motor, w: float) -> None:
     machine = Rotating(motor, w, -0.5, 2.0)
     out = run(kind, machine, initial_flux=[motor.psi_m, -motor.psi_m])

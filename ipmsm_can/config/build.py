@@ -28,9 +28,11 @@ def build_protocol(configs: Sequence[DriveConfig]) -> Protocol:
 def estimator_settings(config: DriveConfig) -> EstimatorSettings:
     """Settings of the estimator, derived defaults (gamma, epsilon) worked out."""
     o = config.observer
-    return EstimatorSettings(o.kind, o.alpha, config.gamma, o.initial_flux, config.epsilon, o.excitation_window,
-                             o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
-                             config.estimate.valid_sigma, config.injection.frequency)
+    return EstimatorSettings(o.kind, config.alpha, config.gamma, o.initial_flux, config.epsilon,
+                             o.excitation_window, o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
+                             config.estimate.valid_sigma, config.injection.frequency,
+                             o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
+                             o.adapt_resistance, o.gamma == "scheduled")
 
 
 def injection_settings(config: DriveConfig) -> InjectionSettings:

@@ -115,6 +115,20 @@ class Quantity(Key):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class QuantityOrWord(Quantity):
+    """A number with a unit, or one word that stands for a rule."""
+
+    word: str
+
+    @property
+    def allowed(self) -> str:
+        return f"{super().allowed}, or {in_toml(self.word)}"
+
+    def read(self, value: Any, pole_pairs: int | None = None) -> Any:
+        return value if value == self.word else super().read(value, pole_pairs)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Choice(Key):
     """One of a few words."""
 

@@ -14,14 +14,14 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from ipmsm_can.config import units
-from ipmsm_can.config.keys import Choice, FilePath, Quantity, Switch
+from ipmsm_can.config.keys import Choice, FilePath, Quantity, QuantityOrWord, Switch
 from ipmsm_can.config.section import KeyProblem, Section
 from ipmsm_can.config.simulation import CLASSICAL_RATE, FD_RATE, SimulationConfig
 from ipmsm_can.estimation.observers.kinds import WINDOW_CAPACITY
 from ipmsm_can.motor import PRESETS, Motor
 
-ObserverKind = Literal["ges", "spmsm_gradient", "spmsm_gradient_max", "spmsm_regression", "active_flux_regression",
-                       "chonam", "injection_extraction", "injection_demodulation"]
+ObserverKind = Literal["ges", "riccati", "spmsm_gradient", "spmsm_gradient_max", "spmsm_regression",
+                       "active_flux_regression", "chonam", "injection_extraction", "injection_demodulation"]
 OBSERVER_KINDS: tuple[str, ...] = get_args(ObserverKind)
 """The observers a configuration may ask for; the one list of them."""
 
@@ -29,6 +29,10 @@ Waveform = Literal["rotating", "pulsating"]
 
 ROTATING_CONVERGENCE = 70.0
 """Convergence rate gamma |Phi|^2 [1/s] of a fast-turning rotor that the default gamma gives."""
+
+ALPHA, RICCATI_ALPHA = 10.0, 100.0
+"""Default bandwidth of the filters [1/s]: the paper's, and for riccati the inverse of a voltage error's correlation
+time, as the filter has a covariance to hold what a narrow one would have to hold."""
 
 CURRENT_LIMIT_SHARE = 0.15
 """Default limit of the high-frequency current as a share of the rated current."""
@@ -126,17 +130,21 @@ class ObserverConfig(Section):
     """The position observer and what it may assume about the samples."""
 
     kind: Annotated[ObserverKind, Choice(
-        doc="Observer; ges is the one of the paper's Proposition 1. The spmsm kinds are for motors with L_d = L_q; "
+        doc="Observer; ges is the one of the paper's Proposition 1, riccati its regression in a Kalman filter, "
+            "which has no gain to choose and knows its uncertainty. The spmsm kinds are for motors with "
+            "L_d = L_q; "
             "the injection kinds need a salient motor that injects at injection.frequency, find the angle modulo "
             "half a turn, and never call it valid.", choices=OBSERVER_KINDS)] = "ges"
-    alpha: Annotated[float, Quantity(
+    alpha: Annotated[float | None, Quantity(
         doc="Bandwidth of the regression's filters (the paper's alpha). In the spmsm_gradient and injection kinds "
             "the angle does not depend on it.",
-        unit=units.PER_SECOND, least=1e-3, most=1e5)] = 10.0
-    gamma: Annotated[float | None, Quantity(
-        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly. "
-            "The spmsm_gradient kinds count it in 1/(Wb^2 s); the injection kinds have none.",
-        unit=units.GRADIENT_GAIN, above=0,
+        unit=units.PER_SECOND, least=1e-3, most=1e5,
+        default=f"{ALPHA:g} 1/s; {RICCATI_ALPHA:g} 1/s for riccati", example=10)] = None
+    gamma: Annotated[float | Literal["scheduled"] | None, QuantityOrWord(
+        doc="Observer gain (the paper's gamma). Above the rate of turning, more gain converges more slowly; "
+            "scheduled, for ges, follows the speed: 2 |omega| / |Phi|^2. "
+            "The spmsm_gradient kinds count it in 1/(Wb^2 s); riccati and the injection kinds have none.",
+        word="scheduled", unit=units.GRADIENT_GAIN, above=0,
         default=f"{ROTATING_CONVERGENCE:g} 1/s / (2 alpha psi_m)^2, which converges at "
                 f"gamma |Phi|^2 = {ROTATING_CONVERGENCE:g} 1/s at high speed; "
                 f"{0.5 * ROTATING_CONVERGENCE:g} 1/s / psi_m^2 for the spmsm_gradient kinds", example=0.5)] = None
@@ -157,6 +165,16 @@ class ObserverConfig(Section):
         unit=units.VOLT, least=0)] = 0.5
     current_noise: Annotated[float, Quantity(
         doc="Noise of the sampled currents, per axis.", unit=units.AMPERE_RMS, above=0)] = 0.02
+    resistance_uncertainty: Annotated[float, Quantity(
+        doc="1-sigma of motor.R, as a share of it; for riccati.", unit=units.PERCENT, least=0, most=100)] = 12.0
+    inductance_uncertainty: Annotated[float, Quantity(
+        doc="1-sigma of motor.L_d and motor.L_q, as a share of them; for riccati.",
+        unit=units.PERCENT, least=0, most=100)] = 6.0
+    adapt_voltage: Annotated[bool, Switch(
+        doc="Whether riccati estimates dead time and a lasting offset of the voltage beside the flux, as far as "
+            "the samples tell; else they count as noise.")] = True
+    adapt_resistance: Annotated[bool, Switch(
+        doc="Whether riccati estimates the error of motor.R as well.")] = True
 
 
 class EstimateConfig(Section):
@@ -278,6 +296,9 @@ class DriveConfig(BaseModel):
         psi_m = self.motor.build().psi_m
         if self.epsilon >= psi_m:
             raise KeyProblem("observer.epsilon", f"a flux below the motor's psi_m, {psi_m:g} Wb")
+        if self.observer.gamma == "scheduled" and self.observer.kind != "ges":
+            raise KeyProblem("observer.gamma", f"a number for observer.kind {self.observer.kind}; only ges has a "
+                                               "schedule")
         rate = self.wire.sample_rate
         if rate is not None and self.observer.kind.startswith("injection_"):
             # A window of whole periods, of samples that are faster than two a period.
@@ -308,16 +329,22 @@ class DriveConfig(BaseModel):
         return self.motor.build()
 
     @property
+    def alpha(self) -> float:
+        """Bandwidth of the regression's filters [1/s]: the given one, or 10, for riccati 100."""
+        given = self.observer.alpha
+        return given if given is not None else RICCATI_ALPHA if self.observer.kind == "riccati" else ALPHA
+
+    @property
     def gamma(self) -> float:
-        """Observer gain: the given one, or 70 1/s over (2 alpha psi_m)^2 [1/(V^2 s)].
+        """Observer gain: the given one, or 70 1/s over (2 alpha psi_m)^2 [1/(V^2 s)], also where it is scheduled.
 
         For the gradients on the flux's length, which converge at 2 gamma psi_m^2, 35 1/s over psi_m^2 [1/(Wb^2 s)].
         """
-        if self.observer.gamma is not None:
+        if isinstance(self.observer.gamma, float):
             return self.observer.gamma
         if self.observer.kind.startswith("spmsm_gradient"):
             return float(0.5 * ROTATING_CONVERGENCE / self.motor.build().psi_m ** 2)
-        return float(ROTATING_CONVERGENCE / (2.0 * self.observer.alpha * self.motor.build().psi_m) ** 2)
+        return float(ROTATING_CONVERGENCE / (2.0 * self.alpha * self.motor.build().psi_m) ** 2)
 
     @property
     def epsilon(self) -> float:

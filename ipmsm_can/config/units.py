@@ -98,6 +98,7 @@ _TURN = Fraction(2.0 * math.pi)
 
 NUMBER = Unit("")
 SAMPLES = Unit("samples")
+PERCENT = Unit("%", {"%": Fraction(1)})
 HENRY = _scaled("H", "num-")
 WEBER = Unit("Wb", {"mWb": Fraction(1, 1000), "Wb": Fraction(1), "V s": Fraction(1)})
 OHM = _scaled("ohm", "um-")

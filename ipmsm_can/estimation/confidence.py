@@ -29,6 +29,9 @@ That is the theory of `ges`; of the other observers it describes
     both regressions      without d: |l| |H[i]|, which bounds it, acts as measurement noise correlated over 1/alpha
     chonam                the error along Phi; Lambda is taken as |l| |H[i]|/|x_hat| in an unknown direction, so a
                           correction spreads that much in every direction
+    riccati               nothing: it brings its own covariance, innovation test and polarity (`observers.riccati`).
+                          Added here is whether the speed is plausible: |Phi| against that of a rotor that turns as
+                          fast as the angle does
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
                           is added.  They see an axis, not its north: polarity is never known, no angle valid.
 """
@@ -42,7 +45,7 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers import kinds
-from ipmsm_can.estimation.observers.common import assumed_motor, injection_delay
+from ipmsm_can.estimation.observers.common import FITS, POLARITY, assumed_motor, injection_delay
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -59,6 +62,8 @@ _LOST_ABOVE = 9.0
 _SIGMA_HYSTERESIS = 1.5
 _POLARITY_SIGMA = math.radians(45.0)
 _UNKNOWN_AXIS = math.pi / 2.0
+_SPEED_ERROR = 0.5
+"""How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
 LOCKED = 1
 POLARITY_KNOWN = 2
@@ -70,6 +75,7 @@ STATE = np.dtype([
     ("p_aa", "f8"), ("p_ab", "f8"), ("p_bb", "f8"),
     ("test", "f8"), ("contraction", "f8"), ("locked", "i8"), ("polarity", "i8"), ("lost", "i8"),
     # What the kind of observer adds; zeros for ges.
+    ("own", "i8"), ("L_0", "f8"), ("volts", "f8"),
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
 ])
@@ -103,6 +109,9 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
         st["neglected"] = abs(motor.ell)
     if kind == kinds.CHONAM:
         st["spread"] = abs(motor.ell)
+    st["own"] = kind == kinds.RICCATI
+    st["L_0"] = abs(motor.L_0)
+    st["volts"] = voltage_uncertainty
     if kind in kinds.MODULO_PI:
         st["axis_only"] = 1
         st["delay"] = injection_delay(kind, injection_frequency, sample_rate)
@@ -153,17 +162,60 @@ def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Flo
 
 
 @kernel
+def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
+               flags: NDArray[np.uint8]) -> None:
+    """Judge a block of `riccati`, which puts out its 1-sigma and its own opinion."""
+    st = state[0]
+    smoothing = 1.0 - math.exp(-st.T_s / INNOVATION_TIME)
+    test = st.test if st.started else 2.0  # of the speed nothing is known yet
+    st.started = 1
+    locked = st.locked
+    lost = st.lost
+    for k in range(flux.shape[1]):
+        s = flux[5, k]
+        opinion = int(flux[6, k])
+        omega = speed[2, k]
+        phi = math.sqrt(regression[1, k] ** 2 + regression[2, k] ** 2)
+        h = math.sqrt(regression[5, k] ** 2 + regression[6, k] ** 2)
+        turning = 2.0 * st.alpha * st.psi_m * abs(omega) / math.sqrt(omega * omega + st.alpha * st.alpha)
+        allowed = _SPEED_ERROR * max(phi, turning) + 4.0 * st.volts + 2.0 * st.L_0 * h
+        off = abs(phi - turning) / max(allowed, 1e-30)
+        if not off < 100.0:
+            off = 100.0
+        test += smoothing * (off - test)
+        fits = opinion & FITS and test < 1.0
+        if locked:
+            if not fits:
+                lost += 1
+                locked = 0
+            elif s > _SIGMA_HYSTERESIS * st.sigma_limit:
+                locked = 0
+        elif fits and s < st.sigma_limit:
+            locked = 1
+        polarity = 1 if opinion & POLARITY else 0
+        sigma[k] = s
+        valid = locked and polarity and s <= st.sigma_limit
+        flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
+    st.test = test
+    st.locked = locked
+    st.lost = lost
+
+
+@kernel
 def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
                      flags: NDArray[np.uint8]) -> None:
     """Judge a block.
 
-    regression: float64 (7, N); flux: float64 (6, N) from an observer; speed: float64 (3, N).
+    regression: float64 (7, N); flux: float64 (7, N) from an observer; speed: float64 (3, N).
     sigma: float64 (N,), 1-sigma of theta_hat [rad electrical], at most pi, which means unknown.
     flags: uint8 (N,), bits LOCKED, POLARITY_KNOWN, VALID.
     """
     st = state[0]
     if st.axis_only:
         _axis_block(flux, speed, state, sigma, flags)
+        return
+    if st.own:
+        _own_block(regression, flux, speed, state, sigma, flags)
         return
     T_s = st.T_s
     alpha = st.alpha

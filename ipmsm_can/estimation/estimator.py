@@ -13,9 +13,10 @@ from ipmsm_can._jit import kernel
 from ipmsm_can.estimation import confidence, excitation, regression, speed
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
-from ipmsm_can.estimation.observers import common
+from ipmsm_can.estimation.observers import common, riccati
 from ipmsm_can.estimation.observers.dispatch import observer_block
-from ipmsm_can.estimation.observers.kinds import KINDS
+from ipmsm_can.estimation.observers.kinds import KINDS, RICCATI
+from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
 from ipmsm_can.estimation.regression import regression_block
 from ipmsm_can.estimation.speed import speed_block
 from ipmsm_can.motor import Motor
@@ -37,6 +38,8 @@ class EstimatorSettings:
     observer's own equation, initial_flux [Wb, Wb], epsilon [Wb];
     excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
     valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
+    For riccati: 1-sigma of the resistance and the inductances as shares of them, and which errors of the voltage
+    are estimated.  scheduled: whether the gain of ges follows the speed.
     """
 
     kind: str
@@ -50,6 +53,17 @@ class EstimatorSettings:
     current_noise: float
     valid_sigma: float
     injection_frequency: float = 400.0
+    resistance_uncertainty: float = 0.12
+    inductance_uncertainty: float = 0.06
+    adapt_voltage: bool = True
+    adapt_resistance: bool = True
+    scheduled: bool = False
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """What `riccati` weighs."""
+        return Uncertainty(self.voltage_uncertainty, self.current_noise, self.resistance_uncertainty,
+                           self.inductance_uncertainty, self.adapt_voltage, self.adapt_resistance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +71,7 @@ class EstimateBlock:
     """Result of a block of N samples; all arrays belong to the same samples in the same order.
 
     regression (7, N): y [V Wb], Phi [V], lambda increment [Wb], H[i] [A/s].
-    flux (6, N): lambda_hat [Wb], x_hat [Wb], innovation [V Wb], correction gain [1/V^2].
+    flux (7, N): lambda_hat [Wb], x_hat [Wb], innovation [V Wb], and the rest as in `observers.common`.
     angle (3, N): theta_hat, smoothed theta [rad electrical, -pi..pi], omega [rad/s electrical].
     excitation (N,): smallest eigenvalue of the windowed integral of Phi Phi^T [V^2 s].
     sigma (N,): 1-sigma of theta_hat [rad electrical], pi = unknown.
@@ -107,7 +121,9 @@ class Estimator:
         self._regression_parameters = regression.parameters(self._assumed, s.alpha, sample_rate)
         self._regression = np.zeros(1, regression.STATE)
         self._observer_parameters = common.parameters(kind, self._assumed, s.alpha, s.gamma, s.epsilon, sample_rate,
-                                                      s.injection_frequency, s.current_noise)
+                                                      s.injection_frequency, s.current_noise, s.uncertainty)
+        self._observer_parameters["pole"] = speed.pole(s.speed_bandwidth, sample_rate)
+        self._observer_parameters["scheduled"] = s.scheduled
         self._observer = self._from_the_start()
         self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, sample_rate)
         self._excitation = excitation.new_state(s.excitation_window, sample_rate)
@@ -198,4 +214,9 @@ class Estimator:
                 doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
             drift = s.voltage_uncertainty * elapsed
             confidence.widen(self._confidence, doubt**2 + drift**2)
+            for name in ("pll_started", "pll_omega", "pll_difference"):
+                fresh[name] = old[name]
+            fresh["pll_theta"] = fresh["pll_hat"] = pll["theta"]
+            if KINDS[s.kind] == RICCATI:
+                riccati.carry_over(self._observer, fresh, turned, doubt**2 + drift**2)
         self._observer = fresh

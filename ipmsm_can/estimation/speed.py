@@ -35,14 +35,36 @@ def new_state(bandwidth: float, epsilon: float, sample_rate: float) -> NDArray[n
     state = np.zeros(1, STATE)
     state["T_s"] = 1.0 / sample_rate
     state["epsilon2"] = epsilon**2
-    state["pole"] = math.exp(-_TWO_PI * bandwidth / sample_rate)
+    state["pole"] = pole(bandwidth, sample_rate)
     return state
+
+
+def pole(bandwidth: float, sample_rate: float) -> float:
+    """The loop's double pole; bandwidth, sample_rate [Hz]."""
+    return math.exp(-_TWO_PI * bandwidth / sample_rate)
 
 
 @kernel
 def wrap(angle: float) -> float:
     """The angle [rad] brought into [-pi, pi)."""
     return angle - _TWO_PI * math.floor((angle + math.pi) / _TWO_PI)
+
+
+@kernel
+def follow(new: float, rests: bool, started: int, theta_hat: float, theta: float, omega: float,
+           omega_difference: float, T_s: float, pole: float) -> tuple[float, float, float]:
+    """One step of the loop to the angle `new`: (theta, omega, omega_difference); rests: x_hat has no direction."""
+    if rests:
+        return new, 0.0, 0.0
+    if not started:
+        return new, omega, omega_difference
+    omega_difference += (1.0 - pole) * (wrap(new - theta_hat) / T_s - omega_difference)
+    theta += omega * T_s
+    error = wrap(new - theta)
+    if abs(error) > SLIP:
+        return new, omega_difference, omega_difference
+    return (wrap(theta + (1.0 - pole * pole) * error), omega + (1.0 - pole) * (1.0 - pole) / T_s * error,
+            omega_difference)
 
 
 @kernel
@@ -55,8 +77,6 @@ def speed_block(flux: NDArray[np.float64], state: NDArray[np.void], out: NDArray
     st = state[0]
     T_s = st.T_s
     pole = st.pole
-    angle_gain = 1.0 - pole * pole
-    speed_gain = (1.0 - pole) * (1.0 - pole) / T_s
     theta_hat = st.theta_hat
     theta = st.theta
     omega = st.omega
@@ -66,25 +86,9 @@ def speed_block(flux: NDArray[np.float64], state: NDArray[np.void], out: NDArray
         x_a = flux[2, k]
         x_b = flux[3, k]
         new = math.atan2(x_b, x_a)
-        if x_a * x_a + x_b * x_b < st.epsilon2:
-            started = 1
-            theta = new
-            omega = 0.0
-            omega_difference = 0.0
-        elif started:
-            step = wrap(new - theta_hat) / T_s
-            omega_difference += (1.0 - pole) * (step - omega_difference)
-            theta += omega * T_s
-            error = wrap(new - theta)
-            if abs(error) > SLIP:
-                theta = new
-                omega = omega_difference
-            else:
-                theta = wrap(theta + angle_gain * error)
-                omega += speed_gain * error
-        else:
-            started = 1
-            theta = new
+        theta, omega, omega_difference = follow(new, x_a * x_a + x_b * x_b < st.epsilon2, started, theta_hat, theta,
+                                                omega, omega_difference, T_s, pole)
+        started = 1
         theta_hat = new
         out[0, k] = theta_hat
         out[1, k] = theta

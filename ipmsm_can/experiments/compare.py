@@ -26,7 +26,8 @@ SAME_GAIN = ("ges", "spmsm_regression", "active_flux_regression", "chonam")
 PROBING_KINDS = ("injection_extraction", "injection_demodulation")
 """Kinds that live on the injected signal and find the angle modulo half a turn."""
 TITLES = {
-    "ges": "proposed (GES)", "chonam": "with Λ (CHONAM)", "active_flux_regression": "d neglected (CHOetaltie)",
+    "ges": "proposed (GES)", "riccati": "regression, Kalman filter",
+    "chonam": "with Λ (CHONAM)", "active_flux_regression": "d neglected (CHOetaltie)",
     "spmsm_regression": "linear regression, SPMSM (BOBetal)", "spmsm_gradient": "gradient, SPMSM (obsort)",
     "spmsm_gradient_max": "gradient, SPMSM, max{0, ·}", "injection_extraction": "extraction (YIetal)",
     "injection_demodulation": "demodulation (GARetal)",
@@ -97,10 +98,10 @@ def variants() -> list[tuple[str, bool]]:
 
 
 def gains_of(scene: Scene, kind: str, published: bool) -> Watcher:
-    """The scene's start, with its gains or the configuration's (alpha 10, gamma fitted to the motor)."""
+    """The scene's start, with its gains or the configuration's (gamma fitted to the motor)."""
     if published:
         return replace(scene.watcher, kind=kind)
-    return replace(scene.watcher, kind=kind, alpha=10.0, gamma=None)
+    return replace(scene.watcher, kind=kind, alpha=None, gamma=None)
 
 
 def _modulo(track: Track, kind: str) -> Track:

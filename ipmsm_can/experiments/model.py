@@ -62,13 +62,13 @@ class Setup:
 class Watcher:
     """An observer and what it is told.
 
-    kind, alpha [1/s], gamma (None: the configuration's default for the kind).  start: initial flux [Wb, Wb], or
+    kind, alpha [1/s] and gamma (None: the configuration's default for the kind).  start: initial flux [Wb, Wb], or
     start_off: degrees electrical by which the initial flux psi_m c(theta) misses the rotor; one of the two.
     scale: factors on the motor parameters the observer is told, by name.
     """
 
     kind: str = "ges"
-    alpha: float = 10.0
+    alpha: float | None = 10.0
     gamma: float | None = 50.0
     start: tuple[float, float] | None = None
     start_off: float = 0.0

@@ -87,8 +87,10 @@ def companion_config(setup: Setup, watcher: Watcher, probing: Probing | None = N
     motor: dict[str, Any] = {key: getattr(setup.machine, key) for key in _MOTOR_KEYS}
     for name, factor in watcher.scale:
         motor[name] *= factor
-    observer: dict[str, Any] = {"kind": watcher.kind, "alpha": watcher.alpha,
+    observer: dict[str, Any] = {"kind": watcher.kind,
                                 "initial_flux": watcher.start or _flux_near(setup, watcher.start_off)}
+    if watcher.alpha is not None:
+        observer["alpha"] = watcher.alpha
     if watcher.gamma is not None:
         observer["gamma"] = watcher.gamma
     injection: dict[str, Any] = {"enabled": False}

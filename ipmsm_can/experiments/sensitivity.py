@@ -29,7 +29,8 @@ def _tuning_figures(tracks: Tracks) -> list[Figure]:
     figures = []
     for name, t in tracks.items():
         w = t.run.watcher
-        pole = slow_pole(w.gamma or 0.0, phi_length(w.alpha, t.run.setup.machine.psi_m, OMEGA_1000), OMEGA_1000)
+        length = phi_length(w.alpha or 0.0, t.run.setup.machine.psi_m, OMEGA_1000)
+        pole = slow_pole(w.gamma or 0.0, length, OMEGA_1000)
         figures += [Figure(f"flux error below 5 % of ψ_m after, {name}", flux_time(t), "s"),
                     Figure(f"slow pole, {name}", pole, "1/s"),
                     Figure(f"rms under pulses, {name}", rms(window(t, _AFTER)), "°",

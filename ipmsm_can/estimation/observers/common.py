@@ -15,11 +15,15 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.filters import filter_coefficients
 from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, Uncertainty, keeps
 from ipmsm_can.motor import Motor
 
 _MOST_PERIODS = 16
 _FILTER_PERIODS = 2.0
 """Time constant of each of the demodulation's two low-passes, in periods of the probing signal."""
+
+FLUX_STATES = 2 + BIASES
+"""States of `riccati`: stator flux and what may be wrong with the voltage."""
 
 PARAMETERS = np.dtype([
     ("kind", "i8"),
@@ -29,6 +33,11 @@ PARAMETERS = np.dtype([
     ("mean", "f8"), ("difference", "f8"), ("noise", "f8"),
     # Probing signal: rad per sample, half its cotangent, samples in the window, filter coefficients.
     ("step", "f8"), ("half_cot", "f8"), ("window", "i8"), ("slow", "f8"), ("average", "f8"),
+    # ges: pole of the loop that gives the speed, and whether the gain follows it.
+    ("pole", "f8"), ("scheduled", "i8"),
+    # riccati: 1-sigma of what is uncertain [V], [ohm], share of L_q; states of the voltage's error.
+    ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
+    ("spread_L", "f8"), ("zone", "f8"), ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
 ])
 
 STATE = np.dtype([
@@ -41,13 +50,22 @@ STATE = np.dtype([
     ("theta", "f8"), ("known", "i8"), ("phase", "f8"), ("count", "i8"), ("slot", "i8"),
     ("slow_i", "c16"), ("slow_d", "c16"), ("bins", "c16", (8,)),
     ("sums", "c16", (7,)), ("fresh", "c16", (7,)), ("ring", "c16", (WINDOW_CAPACITY, 3)),
+    # ges with a scheduled gain: its own phase-locked loop, as `speed` has it.
+    ("pll_started", "i8"), ("pll_hat", "f8"), ("pll_theta", "f8"), ("pll_omega", "f8"), ("pll_difference", "f8"),
+    # riccati: covariance, voltage errors, what these put into the regression, and what it judges itself by.
+    ("P", "f8", (FLUX_STATES, FLUX_STATES)), ("bias", "f8", (BIASES,)),
+    ("unit", "f8", (BIASES, 2)), ("product", "f8", (BIASES,)), ("f_product", "f8", (BIASES,)),
+    ("i_a", "f8"), ("i_b", "f8"), ("memory", "f8"), ("clear", "f8", (3,)), ("test", "f8"),
+    ("polarity", "i8"), ("lost", "i8"),
 ])
 
 # Rows of the array that an observer puts out: estimated stator flux [Wb]; active flux [Wb]; innovation [V Wb],
 # which is |Phi| times the flux innovation [Wb]; and the gain of the correction over the interval [1/V^2].
-# The kinds in MODULO_PI have no correction: their last row is the 1-sigma of the axis [rad], pi = unknown.
-LAMBDA_A, LAMBDA_B, X_A, X_B, INNOVATION, GAIN = range(6)
-ROWS = 6
+# Where the gain is no number, the row holds a 1-sigma [rad], pi = unknown: of the axis for the kinds in MODULO_PI,
+# of the angle for RICCATI, which says in the last row what it thinks of it: bits FITS and POLARITY, else 0.
+LAMBDA_A, LAMBDA_B, X_A, X_B, INNOVATION, GAIN, OPINION = range(7)
+ROWS = 7
+FITS, POLARITY = 1, 2
 
 
 def assumed_motor(kind: int, motor: Motor) -> Motor:
@@ -79,12 +97,15 @@ def window_length(frequency: float, sample_rate: float) -> int:
 
 
 def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: float, sample_rate: float,
-               injection_frequency: float = 400.0, current_noise: float = 0.02) -> NDArray[np.void]:
+               injection_frequency: float = 400.0, current_noise: float = 0.02,
+               uncertainty: Uncertainty | None = None) -> NDArray[np.void]:
     """Record array (1,) of PARAMETERS for a motor as `assumed_motor` gives it.
 
     alpha [1/s]; gamma as in the observer's own equation, [1/(V^2 s)], for the gradients on the flux's length
     [1/(Wb^2 s)]; epsilon [Wb]; sample_rate, injection_frequency [Hz]; current_noise [A rms].
+    uncertainty: what `riccati` weighs; None for its defaults.
     """
+    u = uncertainty or Uncertainty(current=current_noise)
     f = filter_coefficients(alpha, 1.0 / sample_rate)
     p = np.zeros(1, PARAMETERS)
     product = motor.L_d * motor.L_q
@@ -97,9 +118,12 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "step": step, "half_cot": 0.5 / math.tan(0.5 * step),
         "window": window_length(injection_frequency, sample_rate),
         "slow": -math.expm1(-step / 8.0), "average": -math.expm1(-step / (2.0 * math.pi * _FILTER_PERIODS)),
+        "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor), "volts": u.voltage,
+        "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
+        "prior": u.priors(motor), "keep": keeps(sample_rate),
     }
     for name, value in values.items():
-        p[name] = value
+        p[0][name] = value
     return p
 
 

@@ -12,6 +12,10 @@ Phi of its beginning and half with the Phi of its end (Strang splitting), which 
 order in T_s.  The disturbance estimate depends on x_hat itself without delay; in the closing half it is
 evaluated after the correction, by one fixed-point iteration, to keep the pair symmetric.
 
+Scheduled gain.  gamma |Phi|^2 = 2 |omega| puts both poles of the rotating error dynamics at -|omega|, the fastest
+there is: gamma = 2 |omega|/(|Phi|^2 + eps).  omega is that of a loop as in `speed`, up to the sample before; until
+that has pulled in, half the speed that the length of Phi belongs to counts if it is larger.
+
 Needs rotation, or saliency and a probing signal (Assumption 3); gamma [1/(V^2 s)].  Quoted from the paper.
 """
 
@@ -31,6 +35,17 @@ from ipmsm_can.estimation.observers.common import ROWS as ROWS
 from ipmsm_can.estimation.observers.common import X_A as X_A
 from ipmsm_can.estimation.observers.common import X_B as X_B
 from ipmsm_can.estimation.observers.common import along
+from ipmsm_can.estimation.speed import follow
+
+_SLOWEST = 1.0
+"""Speed [rad/s electrical] whose |Phi| keeps the scheduled gain finite at standstill."""
+
+
+@kernel
+def _turning(size2: float, alpha: float, psi_m: float) -> float:
+    """Half the speed [rad/s electrical] at which |Phi|^2 is size2: for the time until the loop has pulled in."""
+    share2 = min(size2 / (2.0 * alpha * psi_m) ** 2, 0.99)
+    return 0.5 * alpha * math.sqrt(share2 / (1.0 - share2))
 
 
 @kernel
@@ -41,8 +56,8 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
     samples: float64 (4, N) as for the regression; only the currents are read.
     regression: float64 (7, N) from `regression_block`.
     parameters, state: record arrays (1,) of `common`; `lambda_a/b` holds the initial flux before the first sample.
-    out: float64 (6, N): lambda_hat [Wb], x_hat [Wb], innovation y - Phi^T x_hat - d_hat before the correction
-    [V Wb], and the total correction gain of the interval (1 - exp(-gamma |Phi|^2 T_s)) / |Phi|^2 [1/V^2].
+    out: float64 (7, N), six rows of it: lambda_hat [Wb], x_hat [Wb], innovation y - Phi^T x_hat - d_hat before the
+    correction [V Wb], and the total correction gain of the interval (1 - exp(-gamma |Phi|^2 T_s)) / |Phi|^2 [1/V^2].
     """
     p = parameters[0]
     L_q = p.L_q
@@ -62,6 +77,7 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
     x_a = st.x_a
     x_b = st.x_b
     started = st.started
+    shortest2 = (2.0 * p.psi_m * _SLOWEST) ** 2
     for k in range(samples.shape[1]):
         i_a = samples[0, k]
         i_b = samples[1, k]
@@ -81,6 +97,8 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
             started = 1
             f_open = (1.0 - present) * s_new
         size2 = phi_a * phi_a + phi_b * phi_b
+        if p.scheduled:
+            half = p.T_s * max(abs(st.pll_omega), _turning(size2, p.alpha, p.psi_m)) / (size2 + shortest2)
         z = half * size2
         if z > 1e-12:
             shrink = math.expm1(-z)
@@ -103,6 +121,13 @@ def ges_block(samples: NDArray[np.float64], regression: NDArray[np.float64], par
         kick_b = c * phi_b
         x_a = l_a - L_q * i_a
         x_b = l_b - L_q * i_b
+        if p.scheduled:
+            angle = math.atan2(x_b, x_a)
+            st.pll_theta, st.pll_omega, st.pll_difference = follow(
+                angle, x_a * x_a + x_b * x_b < epsilon * epsilon, st.pll_started, st.pll_hat, st.pll_theta,
+                st.pll_omega, st.pll_difference, p.T_s, p.pole)
+            st.pll_started = 1
+            st.pll_hat = angle
         out[0, k] = l_a
         out[1, k] = l_b
         out[2, k] = x_a

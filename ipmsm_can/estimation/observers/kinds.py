@@ -14,6 +14,7 @@ INJECTION_DEMODULATION = 8
 
 KINDS = {
     "ges": GES,
+    "riccati": RICCATI,
     "spmsm_gradient": SPMSM_GRADIENT,
     "spmsm_gradient_max": SPMSM_GRADIENT_MAX,
     "spmsm_regression": SPMSM_REGRESSION,

@@ -1,0 +1,128 @@
+"""What may be wrong with the reported voltage, as signals that `riccati` can weigh: four states and their priors.
+
+    v_true = v_reported + sum over j of b_j B_j(t)
+    B_0, B_1   the alpha and the beta axis: a lasting offset b [V] of the voltage or, through R, of a sensor
+    B_2        against the current, phase by phase: dead time, b [V] lost by each phase.  It stands still in the
+               rotor's frame for a whole half-period of each phase, so it is no noise: it is one unknown number
+    B_3        -i: an error b [ohm] of the resistance
+
+Each b is a Gauss-Markov process: its variance never exceeds its prior, and what nothing tells apart falls back to
+zero with the time constant.  So no rule is needed for what to adapt: the filter moves a state as far as the samples
+carry information against its prior variance, and a state whose prior is zero stays zero.
+
+An error of the voltage stands in the regression as well.  With e = F[B_j] and F, H of Lemma 1, F' = 1/(p + alpha),
+
+    y - Phi^T x - d = b n + O(b^2),      n = 2 e^T F[x] - L_0 F[i]^T e - F'[Phi^T e],      F[x] = x - Omega_1/alpha
+
+which follows from Lemma 1 with Omega_1 + b e and Omega_2 + b e in place of Omega_1 and Omega_2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ipmsm_can._jit import kernel
+from ipmsm_can.motor import Motor
+
+BIASES = 4
+OFFSET_SHARE = 0.2
+"""Lasting offset as a share of `voltage_uncertainty`, which dead time has for itself."""
+RESIDUAL_SHARE = 0.1
+"""What none of the four describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
+_KEEPS = (10.0, 10.0, 10.0, 30.0)
+"""Time constants [s]: temperature moves all of them."""
+_HALF_SQRT3 = 0.5 * math.sqrt(3.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """What is not known exactly, 1-sigma: voltage [V], current noise [A rms], shares of R and of L_d and L_q.
+
+    adapt_voltage, adapt_resistance: whether the error is a state; else it is noise, of CORRELATION_TIME.
+    """
+
+    voltage: float = 0.5
+    current: float = 0.02
+    resistance: float = 0.12
+    inductance: float = 0.06
+    adapt_voltage: bool = True
+    adapt_resistance: bool = True
+
+    def priors(self, motor: Motor) -> tuple[float, ...]:
+        """Prior variances of the four states [V^2, V^2, V^2, ohm^2]."""
+        offset = (OFFSET_SHARE * self.voltage) ** 2 if self.adapt_voltage else 0.0
+        dead_time = self.voltage**2 if self.adapt_voltage else 0.0
+        return offset, offset, dead_time, (self.resistance * motor.R) ** 2 if self.adapt_resistance else 0.0
+
+    @property
+    def residual(self) -> float:
+        """1-sigma [V] of the voltage error that is noise and no state."""
+        return RESIDUAL_SHARE * self.voltage if self.adapt_voltage else self.voltage
+
+    def residual_resistance(self, motor: Motor) -> float:
+        """1-sigma [ohm] of the resistance error that is no state."""
+        return 0.0 if self.adapt_resistance else self.resistance * motor.R
+
+    def dead_zone(self, motor: Motor) -> float:
+        """Phase current [A] below which the sign of a phase's current is not relied on."""
+        return max(4.0 * self.current, 0.02 * motor.rated_current)
+
+
+def keeps(sample_rate: float) -> tuple[float, ...]:
+    """Factors by which the states fall back to zero in one sample."""
+    return tuple(math.exp(-1.0 / (sample_rate * t)) for t in _KEEPS)
+
+
+@kernel
+def _clipped(x: float) -> float:
+    return min(1.0, max(-1.0, x))
+
+
+@kernel
+def directions(i_a: float, i_b: float, zone: float, B: NDArray[np.float64]) -> None:
+    """Write B_2 and B_3 of an interval with the mean current i [A] into rows 2 and 3 of B (4, 2)."""
+    phase_a = _clipped(i_a / zone)
+    phase_b = _clipped((-0.5 * i_a + _HALF_SQRT3 * i_b) / zone)
+    phase_c = _clipped((-0.5 * i_a - _HALF_SQRT3 * i_b) / zone)
+    B[2, 0] = -(2.0 * phase_a - phase_b - phase_c) / 3.0
+    B[2, 1] = -(phase_b - phase_c) * _HALF_SQRT3 / 1.5
+    B[3, 0] = -i_a
+    B[3, 1] = -i_b
+
+
+@kernel
+def predict(P: NDArray[np.float64], B: NDArray[np.float64], T_s: float, keep: NDArray[np.float64],
+            prior: NDArray[np.float64], process: float) -> None:
+    """P (6, 6) of (lambda, b) over one interval: lambda += T_s B b, b *= keep; process: growth of lambda [Wb^2].
+
+    P becomes F P F^T + Q, symmetric to the last bit.
+    """
+    for a in range(2):
+        for j in range(BIASES):
+            moved = 0.0
+            for m in range(BIASES):
+                moved += B[m, a] * P[2 + m, 2 + j]
+            # The flux's own part needs the mean of the covariance before and after; column j + 2 holds both.
+            P[a, 2 + j] += 0.5 * T_s * moved
+            P[2 + j, a] = moved
+    for a in range(2):
+        for b in range(a, 2):
+            grown = 0.0
+            for j in range(BIASES):
+                grown += P[a, 2 + j] * B[j, b] + P[b, 2 + j] * B[j, a]
+            P[a, b] += T_s * grown
+            P[b, a] = P[a, b]
+        P[a, a] += process
+    for a in range(2):
+        for j in range(BIASES):
+            P[a, 2 + j] = keep[j] * (P[a, 2 + j] + 0.5 * T_s * P[2 + j, a])
+    for j in range(BIASES):
+        P[2 + j, 0] = P[0, 2 + j]
+        P[2 + j, 1] = P[1, 2 + j]
+        for m in range(BIASES):
+            P[2 + j, 2 + m] *= keep[j] * keep[m]
+        P[2 + j, 2 + j] += (1.0 - keep[j] * keep[j]) * prior[j]
