@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import model_validator
 
 from ipmsm_can.config import units
 from ipmsm_can.config.keys import Choice, Quantity, Switch
 from ipmsm_can.config.section import KeyProblem, Section
-from ipmsm_can.drive.parameters import ANGLE_SOURCES, FINEST_CURRENT_LOOP, DriveNodeSettings, DriveParameters
+from ipmsm_can.drive.parameters import (
+    ANGLE_SOURCES,
+    FINEST_CURRENT_LOOP,
+    AngleSource,
+    DriveNodeSettings,
+    DriveParameters,
+)
 
 CLASSICAL_RATE, FD_RATE = 5000.0, 10_000.0
 """Default sample rates [Hz] of the simulated drive: what a 1 Mbit/s bus carries as single samples, and more."""
@@ -69,9 +75,9 @@ class SimulationConfig(Section):
     injection_ramp: Annotated[float, Quantity(
         doc="Fastest change of the probing amplitude.", unit=units.VOLT_PER_SECOND,
         above=0)] = DriveParameters.injection_ramp
-    angle_source: Annotated[Literal["encoder", "companion", "encoder_then_companion"], Choice(
-        doc="What the control takes its angle from; encoder_then_companion swaps when the encoder fails. Without an "
-            "angle that may be used the drive stops and stays stopped.",
+    angle_source: Annotated[AngleSource, Choice(
+        doc="What the control takes its angle from; encoder_then_companion swaps when the encoder fails. Without "
+            "an angle that may be used the drive stops and stays stopped.",
         choices=ANGLE_SOURCES)] = DriveParameters.angle_source
     encoder_fails_at: Annotated[float | None, Quantity(
         doc="Time from which the encoder says nothing any more.", unit=units.SECOND, least=0, default="never",

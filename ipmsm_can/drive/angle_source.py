@@ -23,8 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.drive.machine import M_FRICTION, M_INERTIA, M_POLE_PAIRS, M_PSI, X_LAMBDA_ALPHA, X_LAMBDA_BETA
-from ipmsm_can.drive.machine import X_OMEGA_M, X_THETA_M, wrap
+from ipmsm_can.drive.machine import (
+    M_FRICTION,
+    M_INERTIA,
+    M_POLE_PAIRS,
+    M_PSI,
+    X_LAMBDA_ALPHA,
+    X_LAMBDA_BETA,
+    X_OMEGA_M,
+    X_THETA_M,
+    wrap,
+)
 from ipmsm_can.drive.parameters import ANGLE_SOURCES, DriveParameters
 
 Array = NDArray[np.float64]
@@ -78,7 +87,7 @@ def pack(p: DriveParameters) -> tuple[Array, Array]:
     """Settings and fresh state as the kernels take them."""
     g = np.zeros(G_SIZE)
     g[G_SOURCE] = ANGLE_SOURCES.index(p.angle_source)
-    g[G_ENCODER_FAILS] = math.inf if p.encoder_fails_at is None else math.ceil(p.encoder_fails_at * p.sample_rate)
+    g[G_ENCODER_FAILS] = p.encoder_fails_sample
     g[G_MAX_AGE] = p.estimate_max_age
     g[G_OPEN_CURRENT] = p.open_loop_current
     g[G_OPEN_OMEGA] = p.open_loop_speed
@@ -143,8 +152,8 @@ def coast(x: Array, load: float, period: float, substeps: int, free_shaft: bool,
           m: Array) -> None:
     """Advance the machine's state x by one control period with all gates off.
 
-    The diodes put v_dc against the current and take it to zero, at rated current within a control period; here it is
-    zero at once.  Beyond v_dc between lines the magnets would drive current through the diodes, which is left out.
+    The diodes put v_dc against the current and take it to zero, at rated current within a control period; here it
+    is zero at once.  Beyond v_dc between lines the magnets would drive current through them, which is left out.
     Arguments as for `machine.advance`.
     """
     h = period / substeps

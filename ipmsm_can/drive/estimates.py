@@ -1,4 +1,4 @@
-"""What the drive makes of PositionEstimates: the C library's rules (firmware_stub/src/receiver.c), on whole blocks."""
+"""What the drive makes of PositionEstimates: the rules of the C library (firmware_stub/src/receiver.c)."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _SIGNALS = ("theta_e", "omega_e", "sigma_theta", "sample_counter", "valid", "loc
 class Estimate:
     """A PositionEstimate that was taken over.
 
-    theta_e [rad electrical], omega_e [rad/s electrical]; sample: the drive's own counter of the sample it belongs to;
-    verdict: what it says of itself, whatever its age.
+    theta_e [rad electrical], omega_e [rad/s electrical].  sample: the drive's own counter of the sample it belongs
+    to.  verdict: what it says of itself, whatever its age.
     """
 
     theta_e: float
@@ -59,8 +59,8 @@ class EstimateReceiver:
     def take(self, raw: NDArray[np.uint8], rows: NDArray[np.intp], sample: int) -> Estimate | None:
         """The last estimate among these rows that can be taken over, None if there is none.
 
-        raw: uint8 (N, 72); rows: those that are PositionEstimates of this node, in order of arrival.  sample: counter
-        of the drive's latest sample.
+        raw: uint8 (N, 72); rows: those that are PositionEstimates of this node, in order of arrival.
+        sample: counter of the drive's latest sample.
         """
         values, intact, counters = self._protocol.decode(MessageKind.POSITION_ESTIMATE, self._node, raw, rows)
         taken = None

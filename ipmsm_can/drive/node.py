@@ -69,7 +69,7 @@ class DriveNode:
         self._rate = p.sample_rate
         self.estimates = EstimateReceiver(protocol, node, p.estimate_max_age, p.angle_sigma_limit)
         self._needs_companion = p.angle_source != "encoder"
-        self._encoder_fails = math.inf if p.encoder_fails_at is None else math.ceil(p.encoder_fails_at * p.sample_rate)
+        self._encoder_fails = p.encoder_fails_sample
         self._last_state = math.nan
         self._block_counter = 0
         self._refused = False
@@ -165,7 +165,8 @@ class DriveNode:
         if due.size:
             self._refused = False
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_STATUS, self.node, {
-            "mode": np.where(state == AngleState.STOPPED, DriveMode.SAFE_STOP, DriveMode.RUNNING), "active_waveform": s.injection_waveform[due],
+            "mode": np.where(state == AngleState.STOPPED, DriveMode.SAFE_STOP, DriveMode.RUNNING),
+            "active_waveform": s.injection_waveform[due],
             "encoder_available": (s.sample[due] < self._encoder_fails) & (self.settings.reference_rate > 0.0),
             "faults": faults, "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
             "temperature": np.full(due.size, _TEMPERATURE),

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from ipmsm_can.motor import Motor
 
 FINEST_CURRENT_LOOP = 12.0
 """Least ratio of sample rate to current bandwidth: with 1.5 periods of delay it leaves 45 deg of phase."""
 
-ANGLE_SOURCES = ("encoder", "companion", "encoder_then_companion")
+AngleSource = Literal["encoder", "companion", "encoder_then_companion"]
+ANGLE_SOURCES: tuple[str, ...] = get_args(AngleSource)
 """What the control may take its angle from."""
 OLDEST_ESTIMATE = 1023
 """An estimate names its sample by ten bits: it must not grow older than that many samples."""
@@ -72,7 +74,7 @@ class DriveParameters:
     rotor_locked: bool = False
     injection_limit: float = 30.0
     injection_ramp: float = 1000.0
-    angle_source: str = "encoder"
+    angle_source: AngleSource = "encoder"
     encoder_fails_at: float | None = None
     estimate_time_to_live: float = 0.01
     angle_sigma_limit: float = 10.0
@@ -108,7 +110,8 @@ class DriveParameters:
         if self.angle_source not in ANGLE_SOURCES:
             raise ValueError(f"angle_source is {self.angle_source!r}; allowed is {', '.join(ANGLE_SOURCES)}")
         if not 0.0 < self.angle_sigma_limit <= 90.0:
-            raise ValueError(f"angle_sigma_limit is {self.angle_sigma_limit!r}; allowed is above 0 and up to 90 deg")
+            raise ValueError(f"angle_sigma_limit is {self.angle_sigma_limit!r}; allowed is above 0 and at most 90, "
+                             "in deg")
         if not 1.0 <= self.estimate_time_to_live * self.sample_rate + 1e-3 < OLDEST_ESTIMATE + 1:
             raise ValueError(f"estimate_time_to_live is {self.estimate_time_to_live!r}; allowed is 1 to "
                              f"{OLDEST_ESTIMATE} samples, {1.0 / self.sample_rate:g} to "
@@ -118,6 +121,13 @@ class DriveParameters:
     def v_max(self) -> float:
         """Largest voltage the inverter gives in every direction [V peak]."""
         return self.v_dc / math.sqrt(3.0)
+
+    @property
+    def encoder_fails_sample(self) -> float:
+        """First sample at which the encoder says nothing any more; inf for never."""
+        if self.encoder_fails_at is None:
+            return math.inf
+        return float(math.ceil(self.encoder_fails_at * self.sample_rate - 1e-3))
 
     @property
     def estimate_max_age(self) -> int:

@@ -307,7 +307,8 @@ class DriveSimulation:
         out = np.empty((O_SIZE, n))
         noise = self._noise.standard_normal((n, 2))
         _simulate(out, self._next, noise, self._x, self._s, self._v, self._injection, self._angle,
-                  self._machine, self._control, self._drive, self._angle_settings, self._speed_track, self._load_track)
+                  self._machine, self._control, self._drive, self._angle_settings, self._speed_track,
+                  self._load_track)
         sample = np.arange(self._next, self._next + n, dtype=np.int64)
         self._next += n
         return DriveSamples(sample, *out)
