@@ -96,7 +96,8 @@ class Rig:
 
     @property
     def angle_error(self) -> NDArray[np.float64]:
-        return np.angle(np.exp(1j * (self.all("control_theta") - self.all("theta_e"))))
+        error: NDArray[np.float64] = np.angle(np.exp(1j * (self.all("control_theta") - self.all("theta_e"))))
+        return error
 
 
 BOTH: dict[str, Any] = {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3}
@@ -132,7 +133,8 @@ def test_extrapolation_agrees_with_the_vectors_of_the_c_library() -> None:
     for row in VECTORS["extrapolations"]:
         found = extrapolate(row["theta"], row["omega"], row["elapsed"])
         assert 0.0 <= found < math.tau
-        assert abs(math.remainder(found - row["expected"], math.tau)) < 3e-5  # the inputs are printed in single precision
+        # the inputs are printed in single precision
+        assert abs(math.remainder(found - row["expected"], math.tau)) < 3e-5
 
 
 @pytest.mark.parametrize(("age", "taken"), [(0, True), (50, True), (51, False), (1000, False)])
@@ -191,7 +193,7 @@ def test_the_control_angle_is_the_estimate_carried_on_to_the_sample() -> None:
 
 @pytest.mark.parametrize("wrong", [{"valid": 0.0}, {"locked": 0.0}, {"polarity_known": 0.0},
                                    {"sigma_theta": 10.5}, {"sigma_theta": 127.5}])
-def test_an_angle_that_may_not_be_used_stops_the_drive_at_once_and_for_good(wrong: dict[str, float]) -> None:
+def test_an_angle_that_may_not_be_used_stops_the_drive_at_once_and_for_good(wrong: dict[str, Any]) -> None:
     rig = Rig(**BOTH)
     rig.silence(WARM_UP)
     rig.run(1000)
