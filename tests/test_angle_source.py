@@ -191,6 +191,18 @@ def test_the_control_angle_is_the_estimate_carried_on_to_the_sample() -> None:
     assert np.abs(wrong).max() < 2e-4
 
 
+def test_the_speed_controlled_is_the_estimated_one() -> None:
+    rig = Rig(**BOTH)
+    rig.silence(WARM_UP)
+    rig.run(FAILS - WARM_UP + 4)
+    for _ in range(300):
+        late = rig.drive.simulation.next_sample - 2
+        rig.hear(late, omega=1.05 * float(rig.all("omega_e")[late]))
+        rig.silence(5)
+    assert rig.state is COMPANION
+    assert rig.all("omega_e")[-1] / M2.pole_pairs == pytest.approx(600.0 * RPM / 1.05, rel=2e-3)
+
+
 @pytest.mark.parametrize("wrong", [{"valid": 0.0}, {"locked": 0.0}, {"polarity_known": 0.0},
                                    {"sigma_theta": 10.5}, {"sigma_theta": 127.5}])
 def test_an_angle_that_may_not_be_used_stops_the_drive_at_once_and_for_good(wrong: dict[str, Any]) -> None:

@@ -169,11 +169,13 @@ def run(case: Case, source: str) -> Run:
 def line(result: Run, encoder_dip: float) -> str:
     """One line of the table."""
     dip = result.dip()
-    ratio = f"{dip / encoder_dip:5.2f}" if encoder_dip else "    -"
+    last = result.states[-1][1]
+    ratio = f"{dip / encoder_dip:5.2f}" if encoder_dip and last is not AngleState.STOPPED else "    -"
+    outcome = {AngleState.STOPPED: "stopped", AngleState.HOLD: "waits"}.get(last, "kept" if result.kept() else "lost")
     states = " ".join(f"{state.name.lower()}@{t:.3f}" for t, state in result.states)
     worst = np.abs(result.angle_error).max()
     return (f"  {result.source:15s} {dip:7.1f} rpm {ratio}  {worst:6.2f} deg  "
-            f"{'kept' if result.kept() else 'not kept':8s} {states}")
+            f"{outcome:8s} {states}")
 
 
 def _work(job: tuple[Case, str]) -> Run:
