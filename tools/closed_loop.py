@@ -171,7 +171,8 @@ def line(result: Run, encoder_dip: float) -> str:
     dip = result.dip()
     last = result.states[-1][1]
     ratio = f"{dip / encoder_dip:5.2f}" if encoder_dip and last is not AngleState.STOPPED else "    -"
-    outcome = {AngleState.STOPPED: "stopped", AngleState.HOLD: "waits"}.get(last, "kept" if result.kept() else "lost")
+    outcome = {AngleState.STOPPED: "stopped", AngleState.HOLD: "waits"}.get(last)
+    outcome = outcome or ("kept" if result.kept() else "lost")
     states = " ".join(f"{state.name.lower()}@{t:.3f}" for t, state in result.states)
     worst = np.abs(result.angle_error).max()
     return (f"  {result.source:15s} {dip:7.1f} rpm {ratio}  {worst:6.2f} deg  "
