@@ -112,7 +112,8 @@ class Recording:
 class CoSimulation:
     """Drives and a companion on one virtual bus.
 
-    period_s: how often both sides look at the bus; commands of the companion reach a drive at its next look.
+    period_s: how often both sides look at the bus; commands of the companion reach a drive at its next look, and
+    never act on a sample taken before they arrive.
     keep_frames: whether all frames are kept in the recording, as a bus logger would see them.
     """
 
@@ -127,6 +128,7 @@ class CoSimulation:
         self._period_ns = round(1e9 * period_s)
         self._keep_frames = keep_frames
         self._now_ns = 0
+        self._looked_ns = 0
         self._done = [0] * len(drives)
 
     def run(self, seconds: float) -> Recording:
@@ -138,7 +140,8 @@ class CoSimulation:
         return self.recording
 
     def _tick(self, now_ns: int) -> None:
-        heard = self.to_drives.receive(now_ns)
+        heard = self.to_drives.receive(self._looked_ns)  # the samples of this tick begin there
+        self._looked_ns = now_ns
         for k, drive in enumerate(self.drives):
             drive.receive(heard)
             target = int(now_ns * drive.simulation.parameters.sample_rate / 1e9)

@@ -281,7 +281,7 @@ class DriveConfig(BaseModel):
         fields: Iterable[tuple[str, Any]] = cls.model_fields.items()
         return {name: field.annotation for name, field in fields}
 
-    @field_validator("injection", mode="before")
+    @field_validator("injection", "simulation", mode="before")
     @classmethod
     def _shaft_speeds(cls, value: Any, info: ValidationInfo) -> Any:
         # rpm counts turns of the shaft: only here are the pole pairs known.  Without a valid motor the
@@ -290,7 +290,7 @@ class DriveConfig(BaseModel):
             return value
         motor = info.data.get("motor")
         result = dict(value)
-        for name, key in InjectionConfig.keys().items():
+        for name, key in cls.sections()[info.field_name or ""].keys().items():
             if isinstance(key, Quantity) and key.unit.is_shaft(value.get(name)):
                 if isinstance(motor, MotorConfig):
                     try:

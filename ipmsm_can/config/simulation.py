@@ -7,9 +7,15 @@ from typing import Annotated
 from pydantic import model_validator
 
 from ipmsm_can.config import units
-from ipmsm_can.config.keys import Quantity, Switch
+from ipmsm_can.config.keys import Choice, Quantity, Switch
 from ipmsm_can.config.section import KeyProblem, Section
-from ipmsm_can.drive.parameters import FINEST_CURRENT_LOOP, DriveNodeSettings, DriveParameters
+from ipmsm_can.drive.parameters import (
+    ANGLE_SOURCES,
+    FINEST_CURRENT_LOOP,
+    AngleSource,
+    DriveNodeSettings,
+    DriveParameters,
+)
 
 CLASSICAL_RATE, FD_RATE = 5000.0, 10_000.0
 """Default sample rates [Hz] of the simulated drive: what a 1 Mbit/s bus carries as single samples, and more."""
@@ -69,6 +75,27 @@ class SimulationConfig(Section):
     injection_ramp: Annotated[float, Quantity(
         doc="Fastest change of the probing amplitude.", unit=units.VOLT_PER_SECOND,
         above=0)] = DriveParameters.injection_ramp
+    angle_source: Annotated[AngleSource, Choice(
+        doc="What the control takes its angle from; encoder_then_companion swaps when the encoder fails. Without "
+            "an angle that may be used the drive stops and stays stopped.",
+        choices=ANGLE_SOURCES)] = DriveParameters.angle_source
+    encoder_fails_at: Annotated[float | None, Quantity(
+        doc="Time from which the encoder says nothing any more.", unit=units.SECOND, least=0, default="never",
+        example="2 s")] = DriveParameters.encoder_fails_at
+    estimate_time_to_live: Annotated[float, Quantity(
+        doc="The companion's angle is used no longer than this after the sample it belongs to; 1 to 1023 samples.",
+        unit=units.SECOND, above=0, most=10)] = DriveParameters.estimate_time_to_live
+    angle_sigma_limit: Annotated[float, Quantity(
+        doc="The companion's angle is used only while its 1-sigma is no larger than this (electrical).",
+        unit=units.DEGREE, above=0, most=90)] = DriveParameters.angle_sigma_limit
+    open_loop_current: Annotated[float, Quantity(
+        doc="Current vector that turns the rotor until the companion knows the angle, with angle_source = "
+            "\"companion\"; 0 = wait, with the current held at zero.",
+        unit=units.AMPERE_PEAK, least=0)] = DriveParameters.open_loop_current
+    open_loop_speed: Annotated[float, Quantity(
+        doc="Speed of that vector, electrical.", unit=units.SPEED, above=0)] = DriveParameters.open_loop_speed
+    open_loop_ramp: Annotated[float, Quantity(
+        doc="Time it takes to reach that speed.", unit=units.SECOND, above=0)] = DriveParameters.open_loop_ramp
     fd: Annotated[bool, Switch(
         doc="Send the samples in CAN FD blocks of seven; --fd does the same.")] = DriveNodeSettings.fd
     timing_rate: Annotated[float, Quantity(

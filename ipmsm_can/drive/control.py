@@ -141,19 +141,37 @@ def current_step(
     v_inj_alpha: float,
     v_inj_beta: float,
 ) -> tuple[float, float]:
+    """`regulate_current` for a torque reference [N m], within the torque limit."""
+    limited = max(-c[C_TORQUE_MAX], min(c[C_TORQUE_MAX], torque))
+    ref_d, ref_q = current_reference(
+        limited, c[C_POLE_PAIRS], c[C_PSI], c[C_L_D] - c[C_L_Q], c[C_MTPA] != 0.0
+    )
+    return regulate_current(s, c, i_alpha, i_beta, theta_e, omega_e, ref_d, ref_q, v_inj_alpha, v_inj_beta)
+
+
+@kernel
+def regulate_current(
+    s: NDArray[np.float64],
+    c: NDArray[np.float64],
+    i_alpha: float,
+    i_beta: float,
+    theta_e: float,
+    omega_e: float,
+    ref_d: float,
+    ref_q: float,
+    v_inj_alpha: float,
+    v_inj_beta: float,
+) -> tuple[float, float]:
     """Commanded voltage (alpha, beta) [V] for the next control period, within the voltage limit.
 
     i_alpha, i_beta: sampled current [A].  theta_e [rad], omega_e [rad/s]: electrical angle and speed at
-    the instant of the sample.  torque: reference [N m].  v_inj: probing voltage, added before the limit.
+    the instant of the sample.  ref_d, ref_q: current reference [A peak].  v_inj: probing voltage, added before
+    the limit.
     """
     cos_k = math.cos(theta_e)
     sin_k = math.sin(theta_e)
     i_d = cos_k * i_alpha + sin_k * i_beta
     i_q = cos_k * i_beta - sin_k * i_alpha
-    limited = max(-c[C_TORQUE_MAX], min(c[C_TORQUE_MAX], torque))
-    ref_d, ref_q = current_reference(
-        limited, c[C_POLE_PAIRS], c[C_PSI], c[C_L_D] - c[C_L_Q], c[C_MTPA] != 0.0
-    )
     e_d = ref_d - i_d
     e_q = ref_q - i_q
     v_d = c[C_KP_D] * e_d + s[S_V_D] - omega_e * c[C_L_Q] * i_q

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.drive.angle_source import AngleState
+from ipmsm_can.drive.estimates import EstimateReceiver
 from ipmsm_can.drive.parameters import DriveNodeSettings as DriveNodeSettings
 from ipmsm_can.drive.simulation import DriveSamples, DriveSimulation
 from ipmsm_can.frames import FrameBlock
@@ -25,6 +27,10 @@ from ipmsm_can.wire.protocol import (
 
 COMMAND_REJECTED = 1 << 5
 """Bit of DriveStatus.faults that says a command was refused since the last DriveStatus."""
+ENCODER_FAILED = 1 << 4
+"""Bit of DriveStatus.faults that says that the encoder has failed."""
+NO_ANGLE = 1 << 6
+"""Bit of DriveStatus.faults ("can") that says that the control needs the companion's angle and cannot use it."""
 COMMANDS_MISSED = 7
 """Largest step of a command's counter that is taken for loss.  A larger one is an old command that was held up
 somewhere; after a loss that long it costs one command more."""
@@ -59,14 +65,25 @@ class DriveNode:
         self._checker = SequenceChecker(16, COMMANDS_MISSED)
         index = protocol.codecs[MessageKind.INJECTION_COMMAND].index
         self._rows = [index[s] for s in ("waveform", "amplitude", "frequency", "axis_angle", "time_to_live")]
-        self._rate = simulation.parameters.sample_rate
+        p = simulation.parameters
+        self._rate = p.sample_rate
+        self.estimates = EstimateReceiver(protocol, node, p.estimate_max_age, p.angle_sigma_limit)
+        self._needs_companion = p.angle_source != "encoder"
+        self._encoder_fails = p.encoder_fails_sample
+        self._last_state = math.nan
         self._block_counter = 0
         self._refused = False
         self._left: NDArray[np.float64] = np.zeros((4, 0))
 
     def receive(self, block: FrameBlock) -> None:
-        """Take in frames from the bus; only InjectionCommands for this node matter."""
-        rows = np.flatnonzero(self._protocol.classify(block.raw) == self._label)
+        """Take in frames from the bus; only InjectionCommands and PositionEstimates for this node matter."""
+        labels = self._protocol.classify(block.raw)
+        if self._needs_companion:
+            rows = np.flatnonzero(labels == MessageKind.POSITION_ESTIMATE * NODES + self.node)
+            estimate = self.estimates.take(block.raw, rows, self.simulation.next_sample) if rows.size else None
+            if estimate is not None:
+                self.simulation.take_estimate(estimate)
+        rows = np.flatnonzero(labels == self._label)
         if not rows.size:
             return
         values, intact, counters = self._protocol.decode(MessageKind.INJECTION_COMMAND, self.node, block.raw,
@@ -139,19 +156,33 @@ class DriveNode:
 
     def _status(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         due = self._due(s, self.settings.status_rate)
-        faults = COMMAND_REJECTED if self._refused else 0
+        if self.settings.status_rate > 0.0:
+            due = np.union1d(due, self._changes(s))  # what happened to the angle is said at once
+        state = s.angle_state[due]
+        no_angle = (state != AngleState.ENCODER) & (state != AngleState.COMPANION) & self._needs_companion
+        faults = (ENCODER_FAILED * (s.sample[due] >= self._encoder_fails) + NO_ANGLE * no_angle
+                  + (COMMAND_REJECTED if self._refused else 0))
         if due.size:
             self._refused = False
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_STATUS, self.node, {
-            "mode": np.full(due.size, DriveMode.RUNNING), "active_waveform": s.injection_waveform[due],
-            "encoder_available": np.full(due.size, self.settings.reference_rate > 0.0),
-            "faults": np.full(due.size, faults), "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
+            "mode": np.where(state == AngleState.STOPPED, DriveMode.SAFE_STOP, DriveMode.RUNNING),
+            "active_waveform": s.injection_waveform[due],
+            "encoder_available": (s.sample[due] < self._encoder_fails) & (self.settings.reference_rate > 0.0),
+            "faults": faults, "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
             "temperature": np.full(due.size, _TEMPERATURE),
             "protocol_version": np.full(due.size, PROTOCOL_VERSION),
             "rejected_commands": np.full(due.size, self.rejected & 0xFF)})
 
+    def _changes(self, s: DriveSamples) -> NDArray[np.intp]:
+        """Samples at which the control went over to something else, or the encoder failed; not the first of all."""
+        before = np.append(self._last_state, s.angle_state[:-1])[:len(s)]
+        if len(s):
+            self._last_state = s.angle_state[-1]
+        return np.flatnonzero(((s.angle_state != before) & ~np.isnan(before)) | (s.sample == self._encoder_fails))
+
     def _reference(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         due = self._due(s, self.settings.reference_rate)
+        due = due[s.sample[due] < self._encoder_fails]
         theta_e = s.theta_e[due]
         if self.settings.encoder_counts:
             step = TWO_PI * self.simulation.motor.pole_pairs / self.settings.encoder_counts

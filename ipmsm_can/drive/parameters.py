@@ -7,11 +7,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from ipmsm_can.motor import Motor
 
 FINEST_CURRENT_LOOP = 12.0
 """Least ratio of sample rate to current bandwidth: with 1.5 periods of delay it leaves 45 deg of phase."""
+
+AngleSource = Literal["encoder", "companion", "encoder_then_companion"]
+ANGLE_SOURCES: tuple[str, ...] = get_args(AngleSource)
+"""What the control may take its angle from."""
+OLDEST_ESTIMATE = 1023
+"""An estimate names its sample by ten bits: it must not grow older than that many samples."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +44,14 @@ class DriveParameters:
     rotor_locked: the rotor stays where it starts; torque control as above.
     injection_limit: largest probing amplitude [V peak], >= 0, whatever is asked.
     injection_ramp: fastest change of the probing amplitude [V/s], > 0.
+    angle_source: one of ANGLE_SOURCES; the last swaps to the companion's angle when the encoder fails.
+    encoder_fails_at: time from which the encoder says nothing any more [s], >= 0; None for never.
+    estimate_time_to_live: age up to which the companion's angle is used [s], 1 to 1023 samples.
+    angle_sigma_limit: largest 1-sigma at which it is used [deg electrical], > 0, at most 90.
+    open_loop_current: current vector that turns the rotor until the companion knows the angle [A peak];
+        0: the drive waits, with the current at zero.
+    open_loop_speed: speed of that vector [rad/s electrical], > 0.
+    open_loop_ramp: time it takes to get there [s], > 0.
 
     Raises ValueError naming the setting, what it got and what it allows.
     """
@@ -59,6 +74,13 @@ class DriveParameters:
     rotor_locked: bool = False
     injection_limit: float = 30.0
     injection_ramp: float = 1000.0
+    angle_source: AngleSource = "encoder"
+    encoder_fails_at: float | None = None
+    estimate_time_to_live: float = 0.01
+    angle_sigma_limit: float = 10.0
+    open_loop_current: float = 0.0
+    open_loop_speed: float = 60.0
+    open_loop_ramp: float = 1.0
 
     def __post_init__(self) -> None:
         _within("sample_rate", self.sample_rate, 100.0, 1e6, "Hz")
@@ -69,25 +91,48 @@ class DriveParameters:
         _within("speed_bandwidth", self.speed_bandwidth, 1e-3, self.current_bandwidth / 4.0,
                 "Hz (a quarter of current_bandwidth)")
         for name, unit in (("v_dc", "V"), ("dead_time_zone", "A"), ("injection_ramp", "V/s"),
-                           ("torque_limit", "N m"), ("i_max", "A")):
+                           ("torque_limit", "N m"), ("i_max", "A"), ("open_loop_speed", "rad/s electrical"),
+                           ("open_loop_ramp", "s")):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} is {value!r}; allowed is a finite number above 0, in {unit}")
         for name, unit in (("dead_time_voltage", "V"), ("current_noise", "A"), ("adc_step", "A"),
-                           ("friction", "N m s/rad"), ("injection_limit", "V")):
+                           ("friction", "N m s/rad"), ("injection_limit", "V"), ("encoder_fails_at", "s"),
+                           ("open_loop_current", "A")):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
+            if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} is {value!r}; allowed is a finite number of 0 or more, in {unit}")
         if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
             raise ValueError(f"current_offset is {self.current_offset!r}; "
                              "allowed are two finite numbers, in A")
         if self.speed_imposed and self.rotor_locked:
             raise ValueError("speed_imposed and rotor_locked are both true; allowed is one of them at most")
+        if self.angle_source not in ANGLE_SOURCES:
+            raise ValueError(f"angle_source is {self.angle_source!r}; allowed is {', '.join(ANGLE_SOURCES)}")
+        if not 0.0 < self.angle_sigma_limit <= 90.0:
+            raise ValueError(f"angle_sigma_limit is {self.angle_sigma_limit!r}; allowed is above 0 and at most 90, "
+                             "in deg")
+        if not 1.0 <= self.estimate_time_to_live * self.sample_rate + 1e-3 < OLDEST_ESTIMATE + 1:
+            raise ValueError(f"estimate_time_to_live is {self.estimate_time_to_live!r}; allowed is 1 to "
+                             f"{OLDEST_ESTIMATE} samples, {1.0 / self.sample_rate:g} to "
+                             f"{OLDEST_ESTIMATE / self.sample_rate:g} s")
 
     @property
     def v_max(self) -> float:
         """Largest voltage the inverter gives in every direction [V peak]."""
         return self.v_dc / math.sqrt(3.0)
+
+    @property
+    def encoder_fails_sample(self) -> float:
+        """First sample at which the encoder says nothing any more; inf for never."""
+        if self.encoder_fails_at is None:
+            return math.inf
+        return float(math.ceil(self.encoder_fails_at * self.sample_rate - 1e-3))
+
+    @property
+    def estimate_max_age(self) -> int:
+        """The time to live of an estimate in whole samples."""
+        return int(self.estimate_time_to_live * self.sample_rate + 1e-3)
 
     def noise_free(self) -> DriveParameters:
         """The same drive with perfect current sensors."""

@@ -17,8 +17,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.drive import control, machine
-from ipmsm_can.drive.control import current_step, speed_step
+from ipmsm_can.drive import angle_source, control, machine
+from ipmsm_can.drive.angle_source import (
+    A_OMEGA,
+    A_OPEN_SPEED,
+    A_OPEN_THETA,
+    A_SAMPLE,
+    A_THETA,
+    COMPANION,
+    ENCODER,
+    G_OPEN_CURRENT,
+    OPEN_LOOP,
+    STOPPED,
+    choose,
+    coast,
+    extrapolate,
+    turn_open_loop,
+)
+from ipmsm_can.drive.control import current_step, regulate_current, speed_step
+from ipmsm_can.drive.estimates import Estimate
 from ipmsm_can.drive.inverter import measure_current
 from ipmsm_can.drive.machine import (
     M_L_Q,
@@ -77,6 +94,8 @@ class DriveSamples:
     speed_reference: the profile's speed [rad/s mechanical].
     injection_waveform, injection_amplitude: probing waveform (0..3) and its amplitude [V peak] as decided
         at t_k, for the interval from t_(k+1) on.
+    angle_state: what the control ran on at t_k, an `AngleState`.
+    control_theta: the angle it took at t_k [rad electrical], NaN where it had none.
     """
 
     sample: NDArray[np.int64]
@@ -96,6 +115,8 @@ class DriveSamples:
     speed_reference: Array
     injection_waveform: Array
     injection_amplitude: Array
+    angle_state: Array
+    control_theta: Array
 
     def __len__(self) -> int:
         return len(self.sample)
@@ -107,10 +128,10 @@ O_SIZE = len(fields(DriveSamples)) - 1
 
 @kernel
 def _simulate(
-    out: Array, first: int, noise: Array, x: Array, s: Array, v: Array, inj: Array, m: Array, c: Array,
-    d: Array, speed_track: Array, load_track: Array,
+    out: Array, first: int, noise: Array, x: Array, s: Array, v: Array, inj: Array, a: Array, m: Array, c: Array,
+    d: Array, g: Array, speed_track: Array, load_track: Array,
 ) -> None:
-    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2); x, s, v, inj are the state, moved on."""
+    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2); x, s, v, inj, a are the state, moved on."""
     period = d[D_PERIOD]
     substeps = int(d[D_SUBSTEPS])
     free_shaft = d[D_FREE_SHAFT] != 0.0
@@ -153,12 +174,36 @@ def _simulate(
         inj_alpha, inj_beta = probing.step(inj, period, d[D_INJECTION_RAMP], d[D_INJECTION_LIMIT])
         out[14, j] = inj[probing.W_WAVEFORM]
         out[15, j] = inj[probing.W_AMPLITUDE]
-        torque = speed_step(s, c, omega_m, reference) if free_shaft else load
-        v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta_e, omega_e, torque,
-                                       inj_alpha, inj_beta)
-
         load_mean = 0.5 * (load + value_at(load_track, k + 1.0, True))
         omega_end = 0.0 if locked else value_at(speed_track, k + 1.0, True)
+        state = choose(a, g, k, reference, free_shaft)
+        out[16, j] = state
+        out[17, j] = math.nan
+        if state == STOPPED:
+            v[:] = 0.0
+            coast(x, load_mean, period, substeps, free_shaft, omega_end, m)
+            continue
+        if state == ENCODER:
+            out[17, j] = theta_e
+            torque = speed_step(s, c, omega_m, reference) if free_shaft else load
+            v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta_e, omega_e, torque,
+                                           inj_alpha, inj_beta)
+        elif state == COMPANION:
+            omega = a[A_OMEGA]
+            theta = extrapolate(a[A_THETA], omega, (k - a[A_SAMPLE]) * period)
+            out[17, j] = wrap(theta)
+            torque = speed_step(s, c, omega / pole_pairs, reference) if free_shaft else load
+            v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta, omega, torque,
+                                           inj_alpha, inj_beta)
+        elif state == OPEN_LOOP:
+            out[17, j] = a[A_OPEN_THETA]
+            v_alpha, v_beta = regulate_current(s, c, measured_alpha, measured_beta, a[A_OPEN_THETA],
+                                               a[A_OPEN_SPEED], g[G_OPEN_CURRENT], 0.0, inj_alpha, inj_beta)
+            turn_open_loop(a, g, reference, period)
+        else:
+            v_alpha, v_beta = regulate_current(s, c, measured_alpha, measured_beta, 0.0, 0.0, 0.0, 0.0,
+                                               inj_alpha, inj_beta)
+
         advance(x, v[V_BEGINS], v[V_BEGINS + 1], load_mean, period, substeps, free_shaft, omega_end,
                 d[D_DEAD_TIME_VOLTAGE], d[D_DEAD_TIME_ZONE], m)
         for axis in range(2):
@@ -207,6 +252,7 @@ class DriveSimulation:
             self._v[place] = -omega_e * motor.psi_m * math.sin(angle)
             self._v[place + 1] = omega_e * motor.psi_m * math.cos(angle)
         self._injection = np.zeros(probing.W_SIZE)
+        self._angle_settings, self._angle = angle_source.pack(p)
         self._noise = np.random.default_rng(seed)
         self._next = 0
 
@@ -246,14 +292,23 @@ class DriveSimulation:
             raise ValueError(f"axis_angle is {axis_angle!r}; allowed is a finite angle, in rad electrical")
         probing.ask(self._injection, waveform, amplitude, frequency, axis_angle, ttl_samples)
 
+    def take_estimate(self, estimate: Estimate) -> None:
+        """Let this estimate be the last one from the next sample on."""
+        self._angle[angle_source.A_HELD] = 1.0
+        self._angle[A_SAMPLE] = estimate.sample
+        self._angle[A_THETA] = estimate.theta_e
+        self._angle[A_OMEGA] = estimate.omega_e
+        self._angle[angle_source.A_VERDICT] = estimate.verdict
+
     def run(self, n: int) -> DriveSamples:
         """The next n samples, n >= 0."""
         if n < 0:
             raise ValueError(f"n is {n!r}; allowed is 0 or more samples")
         out = np.empty((O_SIZE, n))
         noise = self._noise.standard_normal((n, 2))
-        _simulate(out, self._next, noise, self._x, self._s, self._v, self._injection, self._machine,
-                  self._control, self._drive, self._speed_track, self._load_track)
+        _simulate(out, self._next, noise, self._x, self._s, self._v, self._injection, self._angle,
+                  self._machine, self._control, self._drive, self._angle_settings, self._speed_track,
+                  self._load_track)
         sample = np.arange(self._next, self._next + n, dtype=np.int64)
         self._next += n
         return DriveSamples(sample, *out)
