@@ -108,6 +108,20 @@ def test_the_other_messages_and_their_rates() -> None:
         assert abs(r["omega_e"] - step.samples.omega_e[k]) <= 0.126
 
 
+def test_timing_of_blocks_names_the_sample_that_was_sent() -> None:
+    """The block that holds sample k is sent with the last of its seven samples."""
+    step = drive(fd=True, rate=10_000.0, timing_rate=1000.0).step(100)
+    last_sent = -1
+    named = []
+    for can_id, data in zip(step.frames.can_id, step.frames.data, strict=True):
+        if can_id == 0x120:
+            last_sent += 7
+        elif can_id == 0x140:
+            named.append(int(data[:4].view("<u4")[0]))
+            assert named[-1] == last_sent
+    assert named == [6, 13, 27, 34, 48, 55, 69, 76, 90]  # none before the first block
+
+
 def test_encoder_of_finite_resolution_rounds_to_its_own_steps() -> None:
     step = drive(reference_rate=500.0, encoder_counts=6144).step(5000)
     grid = math.tau * M2.pole_pairs / 6144
