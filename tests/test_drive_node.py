@@ -119,7 +119,7 @@ def test_timing_of_blocks_names_the_sample_that_was_sent() -> None:
         elif can_id == 0x140:
             named.append(int(data[:4].view("<u4")[0]))
             assert named[-1] == last_sent
-    assert named == [6, 13, 27, 34, 48, 55, 69, 76, 90]  # none before the first block
+    assert named == [6, 20, 27, 34, 48, 55, 69, 76, 90]  # none before the first block
 
 
 def test_encoder_of_finite_resolution_rounds_to_its_own_steps() -> None:
