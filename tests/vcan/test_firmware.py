@@ -157,15 +157,16 @@ def test_a_killed_companion_and_the_next_one(program: str, config: Path, tmp_pat
     """Killed while the drive probes: probing ends by the time to live and the angle is refused; a new companion
     finds the rotor again and probes again."""
     dump = tmp_path / "dump.log"
-    with dumping(dump), stub(program, tmp_path, "--rpm", "100") as drive:
-        with companion(config, "--transmit") as process:
-            drive.wait_for(event="probing", waveform=1)
-            drive.wait_for(event="angle", verdict="usable")
-            time.sleep(0.5)
-            before = len(drive.log)
-            process.kill()
-            off = drive.wait_for(before, event="probing", waveform=0)
-            drive.wait_for(before, event="angle", verdict="missing")
+    # The companion first: where it has to compile its kernels, nobody else should need the processor.
+    with (dumping(dump), companion(config, "--transmit") as process,
+          stub(program, tmp_path, "--rpm", "100") as drive):
+        drive.wait_for(event="probing", waveform=1)
+        drive.wait_for(event="angle", verdict="usable")
+        time.sleep(0.5)
+        before = len(drive.log)
+        process.kill()
+        off = drive.wait_for(before, event="probing", waveform=0)
+        drive.wait_for(before, event="angle", verdict="missing")
         drive.wait_for(off, event="counts")
         silent = next(e for e in reversed(drive.log) if e["event"] == "counts")
         assert silent["probing"] == 0
