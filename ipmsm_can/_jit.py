@@ -57,16 +57,15 @@ def _kernel_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _cache_root() -> Path:
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
+def cache_root() -> Path:
+    """Folder for what is compiled on this machine; it need not exist."""
     base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(base) / "ipmsm_can"
 
 
 def _select_cache() -> None:
-    root = _cache_root()
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    root = Path(chosen) if chosen else cache_root()
     folder = root / f"kernels-{_kernel_digest()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -41,6 +41,15 @@ def m2(alpha: float = 5.0, gamma: float = 50.0) -> dict[str, Any]:
     return {"motor": {"preset": "m2"}, "observer": {"alpha": alpha, "gamma": gamma, "initial_flux": [0.5, 2]}}
 
 
+KIND: list[type[DriveNode]] = [DriveNode]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kind(node_class: type[DriveNode]) -> None:
+    """Every test here runs with the package's own drive and with the one on the C library."""
+    KIND[0] = node_class
+
+
 @dataclass
 class Bench:
     """A co-simulation and what is asked of it."""
@@ -77,7 +86,7 @@ class Bench:
 def bench(config: dict[str, Any], track: Profile, motor: Any = M2, rate: float = 5000.0, fd: bool = False,
           faults: BusFaults | None = None, **parameters: Any) -> Bench:
     simulation = DriveSimulation(motor, DriveParameters(sample_rate=rate, **parameters), track)
-    drive = DriveNode(PROTOCOL, 0, simulation, DriveNodeSettings(fd=fd))
+    drive = KIND[0](PROTOCOL, 0, simulation, DriveNodeSettings(fd=fd))
     companion = Companion([config_from(config)], PROTOCOL, transmit=True)
     return Bench(CoSimulation([drive], companion, faults), drive, companion, rate)
 
@@ -115,7 +124,8 @@ def test_m2_torque_pulses(alpha: float, gamma: float, fd: bool) -> None:
     assert rms(error[t > 1.5]) < 0.05
     assert valid[t > 0.5].all()
     assert not b.count("lost") and not b.count("gaps")
-    assert b.node.view.estimates == 2500
+    # In CAN FD the first DriveTiming has no block to speak of yet; with the second, 20 ms on, sample 0 is too old.
+    assert b.node.view.estimates == (2499 if fd else 2500)
 
 
 @pytest.mark.parametrize("fd", [False, True])
@@ -313,8 +323,8 @@ def test_the_same_seed_gives_the_same_bits() -> None:
 
 
 def test_two_drives_on_one_bus() -> None:
-    drives = [DriveNode(PROTOCOL, n, DriveSimulation(M2, DriveParameters(sample_rate=5000.0), PULSES, seed=n),
-                        DriveNodeSettings()) for n in (2, 9)]
+    drives = [KIND[0](PROTOCOL, n, DriveSimulation(M2, DriveParameters(sample_rate=5000.0), PULSES, seed=n),
+                      DriveNodeSettings()) for n in (2, 9)]
     configs = [config_from({**m2(), "wire": {"node": n}}) for n in (2, 9)]
     companion = Companion(configs, PROTOCOL, True)
     CoSimulation(drives, companion).run(1.0)

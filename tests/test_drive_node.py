@@ -25,10 +25,19 @@ DATABASE: Any = cantools.database.load_file(default_dbc_path())
 RATE = 5000.0
 
 
+KIND: list[type[DriveNode]] = [DriveNode]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def kind(node_class: type[DriveNode]) -> None:
+    """Every test here runs with the package's own frames and with those of the C library."""
+    KIND[0] = node_class
+
+
 def drive(node: int = 0, fd: bool = False, rate: float = RATE, limit: float = 30.0, **rates: Any) -> DriveNode:
     parameters = DriveParameters(sample_rate=rate, injection_limit=limit)
     simulation = DriveSimulation(M2, parameters, profile.torque_pulses())
-    return DriveNode(PROTOCOL, node, simulation, DriveNodeSettings(fd=fd, **rates))
+    return KIND[0](PROTOCOL, node, simulation, DriveNodeSettings(fd=fd, **rates))
 
 
 def read(step: Step, name: str, node: int = 0) -> list[dict[str, Any]]:
@@ -61,7 +70,8 @@ def test_samples_as_cantools_reads_them(node: int) -> None:
     s, frames = step.samples, read(step, "DriveSample", node)
     assert [f["sample_counter"] for f in frames] == [k % 16 for k in range(1000)]
     for name, unit in (("i_alpha", 0.005), ("i_beta", 0.005), ("v_alpha", 0.025), ("v_beta", 0.025)):
-        assert np.abs(np.array([f[name] for f in frames]) - getattr(s, name)).max() <= 0.5001 * unit
+        # 0.5 of a code; the C library's single precision may see a halfway point 0.001 of a code away
+        assert np.abs(np.array([f[name] for f in frames]) - getattr(s, name)).max() <= 0.501 * unit
 
 
 def test_blocks_as_cantools_reads_them() -> None:
@@ -106,6 +116,20 @@ def test_the_other_messages_and_their_rates() -> None:
         k = r["sample_counter"]
         assert abs(math.remainder(r["theta_e"] - step.samples.theta_e[k], math.tau)) <= 4.8e-5
         assert abs(r["omega_e"] - step.samples.omega_e[k]) <= 0.126
+
+
+def test_timing_of_blocks_names_the_sample_that_was_sent() -> None:
+    """The block that holds sample k is sent with the last of its seven samples."""
+    step = drive(fd=True, rate=10_000.0, timing_rate=1000.0).step(100)
+    last_sent = -1
+    named = []
+    for can_id, data in zip(step.frames.can_id, step.frames.data, strict=True):
+        if can_id == 0x120:
+            last_sent += 7
+        elif can_id == 0x140:
+            named.append(int(data[:4].view("<u4")[0]))
+            assert named[-1] == last_sent
+    assert named == [6, 20, 27, 34, 48, 55, 69, 76, 90]  # none before the first block
 
 
 def test_encoder_of_finite_resolution_rounds_to_its_own_steps() -> None:
@@ -205,8 +229,8 @@ def test_what_cannot_be_executed_is_refused_and_the_old_command_stays(signal: st
     hear(d, PROTOCOL.encode(MessageKind.INJECTION_COMMAND, 0, {
         "waveform": 1.0, "amplitude": 5.0, "frequency": 400.0, "axis_angle": 0.0, "time_to_live": 100.0,
         signal: value}, 1))
-    assert d.rejected == 1
     amplitude = d.step(1000).samples.injection_amplitude
+    assert d.rejected == 1
     assert amplitude[:300].min() == pytest.approx(5.0)
     assert np.flatnonzero(amplitude).max() == 399  # the first command's 100 ms
 
@@ -226,6 +250,7 @@ def test_lost_commands_do_not_matter_but_a_jump_back_by_one_does() -> None:
         assert obeyed(d, 300)
     assert d.rejected == 0
     hear(d, command(0 + 16))  # 15 ahead, or one behind: a replayed older frame
+    d.step(1)
     assert d.rejected == 1
 
 
@@ -246,5 +271,5 @@ def test_a_command_that_was_held_up_is_not_obeyed(age: int) -> None:
     d = drive()
     hear(d, command(20, waveform=0.0, amplitude=0.0))
     hear(d, command(20 - age, time_to_live=40.0))
-    assert d.rejected == 1
     assert not obeyed(d, 300)
+    assert d.rejected == 1

@@ -25,6 +25,7 @@ examples:
   ipmsm-can drive drive.toml --profile crane.toml -i socketcan -c vcan0 --duration 60
   ipmsm-can drive left.toml right.toml -i socketcan -c vcan0  two drives on one bus
   ipmsm-can drive -i socketcan -c vcan0 --fd                  10 kHz in CAN FD blocks
+  ipmsm-can drive -i socketcan -c vcan0 --firmware            through the C library for a drive's microcontroller
 
 a profile file:
   speed_rpm = [[0, 0], [1, 20], [2, 1000]]       breakpoints [s, rpm mechanical]; or speed_rad_s
@@ -52,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="of the sensor noise (default: 0)")
     parser.add_argument("--theta0", type=_angle, default=0.0, metavar="DEG",
                         help="rotor angle at the start, electrical (default: 0)")
+    parser.add_argument("--firmware", action="store_true",
+                        help="speak through the C library of firmware_stub, compiled on first use (needs cffi and "
+                             "a C compiler); it never probes with more than 30 V")
     parser.add_argument("--quiet", action="store_true", help="no status while it runs, only the summary")
     bus.add_arguments(parser)
 
@@ -94,12 +98,13 @@ def main(args: argparse.Namespace) -> int:
     fd = "fd" in args or any(c.simulation.fd for c in configs)
     protocol = build_protocol(configs)
     with bus.patience():
-        warm_up_drives(build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args), protocol)
-    drives = build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args)
+        warm_up_drives(build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args,
+                                    args.firmware), protocol)
+    drives = build_drives(configs, protocol, profile, args.theta0, args.seed, "fd" in args, args.firmware)
     duration = profile.duration if args.duration is None else args.duration
     with bus.stop_on_signals(duration) as stop, bus.open_bus(args, fd) as port:
         runner = DriveRunner(port, drives, args.tick)
-        monitor = DriveMonitor(runner, duration)
+        monitor = DriveMonitor(runner, duration, "ipmsm-can drive" + " --firmware" * args.firmware)
         return bus.serve("drive", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)[0]
 
 
@@ -118,18 +123,24 @@ def read_profile(name: str) -> Profile:
 
 
 def build_drives(configs: tuple[DriveConfig, ...], protocol: Protocol, profile: Profile, theta_0: float = 0.0,
-                 seed: int = 0, fd: bool = False) -> list[DriveNode]:
+                 seed: int = 0, fd: bool = False, firmware: bool = False) -> list[DriveNode]:
     """One simulated drive for each configuration; each has noise of its own, from `seed` on.
 
-    theta_0 [rad electrical]; fd: CAN FD for all, whatever simulation.fd says.
-    Raises ValueError naming the key where the settings of a drive do not go together.
+    theta_0 [rad electrical]; fd: CAN FD for all, whatever simulation.fd says; firmware: through the C library.
+    Raises ValueError naming the key where the settings of a drive do not go together, or saying what the C library
+    lacks.
     """
     from ipmsm_can.config.build import drive_node_settings, drive_parameters
     from ipmsm_can.drive.node import DriveNode
     from ipmsm_can.drive.simulation import DriveSimulation
 
+    kind: type[DriveNode] = DriveNode
+    if firmware:
+        from ipmsm_can.drive.firmware import FirmwareNode
+
+        kind = FirmwareNode
     drives = []
     for k, config in enumerate(configs):
         simulation = DriveSimulation(config.build_motor(), drive_parameters(config, fd), profile, theta_0, seed + k)
-        drives.append(DriveNode(protocol, config.wire.node, simulation, drive_node_settings(config, fd)))
+        drives.append(kind(protocol, config.wire.node, simulation, drive_node_settings(config, fd)))
     return drives

@@ -35,7 +35,8 @@ COMMANDS_MISSED = 7
 """Largest step of a command's counter that is taken for loss.  A larger one is an old command that was held up
 somewhere; after a loss that long it costs one command more."""
 _AXES = ("i_alpha", "i_beta", "v_alpha", "v_beta")
-_TEMPERATURE = 40.0
+TEMPERATURE = 40.0
+"""What it says of its heat-sink [degC]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +120,11 @@ class DriveNode:
         at = np.concatenate([p[0] for p in parts])
         order = np.argsort(at, kind="stable")
         raw = np.concatenate([p[1] for p in parts])[order]
-        t_ns = t0_ns + np.round(at[order] * (1e9 / self._rate)).astype(np.int64)
-        return Step(FrameBlock(raw, t_ns), s)
+        return Step(FrameBlock(raw, self.time_of(at[order], t0_ns)), s)
+
+    def time_of(self, sample: NDArray[np.int64], t0_ns: int) -> NDArray[np.int64]:
+        """When these samples are taken [ns]; t0_ns is the time of sample 0."""
+        return t0_ns + np.round(sample * (1e9 / self._rate)).astype(np.int64)
 
     def _singles(self, samples: NDArray[np.float64],
                  counter: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
@@ -144,14 +148,20 @@ class DriveNode:
         self._block_counter += m
         return starts + BLOCK_SAMPLES - 1, raw
 
+    def every(self, rate: float) -> int:
+        """Samples between two messages that are due `rate` times a second [Hz]; 0 for never."""
+        return max(1, round(self._rate / rate)) if rate > 0.0 else 0
+
     def _due(self, s: DriveSamples, rate: float) -> NDArray[np.intp]:
-        if rate <= 0.0:
-            return np.zeros(0, np.intp)
-        return np.flatnonzero(s.sample % max(1, round(self._rate / rate)) == 0)
+        every = self.every(rate)
+        return np.flatnonzero(s.sample % every == 0) if every else np.zeros(0, np.intp)
 
     def _timing(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-        sent = s.sample[self._due(s, self.settings.timing_rate)]
-        return sent, self._protocol.encode(MessageKind.DRIVE_TIMING, self.node, {
+        due = sent = s.sample[self._due(s, self.settings.timing_rate)]
+        if self.settings.fd:  # the block that holds a sample goes out with the last of its samples
+            sent = (due + 1) // BLOCK_SAMPLES * BLOCK_SAMPLES - 1
+            due, sent = due[sent >= 0], sent[sent >= 0]
+        return due, self._protocol.encode(MessageKind.DRIVE_TIMING, self.node, {
             "sample_counter": sent & 0xFFFFFFFF, "sample_rate": np.full(sent.size, self._rate)})
 
     def _status(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
@@ -169,7 +179,7 @@ class DriveNode:
             "active_waveform": s.injection_waveform[due],
             "encoder_available": (s.sample[due] < self._encoder_fails) & (self.settings.reference_rate > 0.0),
             "faults": faults, "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
-            "temperature": np.full(due.size, _TEMPERATURE),
+            "temperature": np.full(due.size, TEMPERATURE),
             "protocol_version": np.full(due.size, PROTOCOL_VERSION),
             "rejected_commands": np.full(due.size, self.rejected & 0xFF)})
 
@@ -183,10 +193,14 @@ class DriveNode:
     def _reference(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         due = self._due(s, self.settings.reference_rate)
         due = due[s.sample[due] < self._encoder_fails]
-        theta_e = s.theta_e[due]
-        if self.settings.encoder_counts:
-            step = TWO_PI * self.simulation.motor.pole_pairs / self.settings.encoder_counts
-            theta_e = step * np.round(theta_e / step)
+        theta_e = self.encoder(s.theta_e[due])
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_REFERENCE, self.node, {
             "theta_e": self._protocol.angle(MessageKind.DRIVE_REFERENCE, "theta_e", theta_e),
             "omega_e": s.omega_e[due], "sample_counter": s.sample[due] & 0xFFFFFFFF})
+
+    def encoder(self, theta_e: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The angle [rad electrical] as the encoder tells it."""
+        if not self.settings.encoder_counts:
+            return theta_e
+        step = TWO_PI * self.simulation.motor.pole_pairs / self.settings.encoder_counts
+        return step * np.round(theta_e / step)

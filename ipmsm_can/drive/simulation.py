@@ -6,6 +6,9 @@ Time line.  At t_k the current is sampled; control and injection then make the v
 t_(k+1) to t_(k+2), while the voltage made at t_(k-1) is being applied.  Sample k reports the current at
 t_k and the commanded voltage of the interval that ended at t_k, which is exactly its mean; an injection
 command given before sample k therefore first shows in the voltage of sample k + 2.
+
+The probing voltage of a block is made before the block is simulated, by the generator here or by somebody else:
+it depends on commands only, and those come between blocks.
 """
 
 from __future__ import annotations
@@ -127,11 +130,20 @@ O_SIZE = len(fields(DriveSamples)) - 1
 
 
 @kernel
+def _probe(out: Array, inj: Array, d: Array) -> None:
+    """Fill out (4, n) with what `DriveSimulation.run` takes for probing; inj is the state, moved on."""
+    for j in range(out.shape[1]):
+        out[0, j], out[1, j] = probing.step(inj, d[D_PERIOD], d[D_INJECTION_RAMP], d[D_INJECTION_LIMIT])
+        out[2, j] = inj[probing.W_WAVEFORM]
+        out[3, j] = inj[probing.W_AMPLITUDE]
+
+
+@kernel
 def _simulate(
-    out: Array, first: int, noise: Array, x: Array, s: Array, v: Array, inj: Array, a: Array, m: Array, c: Array,
+    out: Array, first: int, noise: Array, probe: Array, x: Array, s: Array, v: Array, a: Array, m: Array, c: Array,
     d: Array, g: Array, speed_track: Array, load_track: Array,
 ) -> None:
-    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2); x, s, v, inj, a are the state, moved on."""
+    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2), probe (4, n); x, s, v, a are moved on."""
     period = d[D_PERIOD]
     substeps = int(d[D_SUBSTEPS])
     free_shaft = d[D_FREE_SHAFT] != 0.0
@@ -171,9 +183,10 @@ def _simulate(
         out[12, j] = v[V_INJ_ENDED + 1]
         out[13, j] = reference
 
-        inj_alpha, inj_beta = probing.step(inj, period, d[D_INJECTION_RAMP], d[D_INJECTION_LIMIT])
-        out[14, j] = inj[probing.W_WAVEFORM]
-        out[15, j] = inj[probing.W_AMPLITUDE]
+        inj_alpha = probe[0, j]
+        inj_beta = probe[1, j]
+        out[14, j] = probe[2, j]
+        out[15, j] = probe[3, j]
         load_mean = 0.5 * (load + value_at(load_track, k + 1.0, True))
         omega_end = 0.0 if locked else value_at(speed_track, k + 1.0, True)
         state = choose(a, g, k, reference, free_shaft)
@@ -300,15 +313,23 @@ class DriveSimulation:
         self._angle[A_OMEGA] = estimate.omega_e
         self._angle[angle_source.A_VERDICT] = estimate.verdict
 
-    def run(self, n: int) -> DriveSamples:
-        """The next n samples, n >= 0."""
+    def run(self, n: int, probe: Array | None = None) -> DriveSamples:
+        """The next n samples, n >= 0.
+
+        probe: float64 (4, n), what is decided at each of them in place of the generator here: probing voltage
+        (alpha, beta) [V] for the interval from t_(k+1) on, waveform 0..3, amplitude [V peak].
+        """
         if n < 0:
             raise ValueError(f"n is {n!r}; allowed is 0 or more samples")
+        if probe is None:
+            probe = np.empty((4, n))
+            _probe(probe, self._injection, self._drive)
+        elif probe.shape != (4, n):
+            raise ValueError(f"probe has the shape {probe.shape}; allowed is (4, {n})")
         out = np.empty((O_SIZE, n))
         noise = self._noise.standard_normal((n, 2))
-        _simulate(out, self._next, noise, self._x, self._s, self._v, self._injection, self._angle,
-                  self._machine, self._control, self._drive, self._angle_settings, self._speed_track,
-                  self._load_track)
+        _simulate(out, self._next, noise, probe, self._x, self._s, self._v, self._angle, self._machine,
+                  self._control, self._drive, self._angle_settings, self._speed_track, self._load_track)
         sample = np.arange(self._next, self._next + n, dtype=np.int64)
         self._next += n
         return DriveSamples(sample, *out)
