@@ -13,6 +13,7 @@ from ipmsm_can.config.build import estimator_settings, injection_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import clipping, confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
+from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.injection import meter
 from ipmsm_can.injection.scheduler import Command, InjectionScheduler
@@ -188,7 +189,7 @@ class Node:
         clipped = run.doubt & np.uint8(CLIPPED)
         if self.distrusting or clipped.any():
             clipping.hold_block(clipped, estimate.regression, estimate.flux, estimate.angle, self._settings.alpha,
-                                1.0 / run.sample_rate, self._clipping, estimate.flags)
+                                1.0 / run.sample_rate, KINDS[self._settings.kind], self._clipping, estimate.flags)
         self.note(run, estimate, meter.meter_block(run.values, self.meter))
         return estimate
 

@@ -15,6 +15,7 @@ from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, Profile, constant
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import clipping, confidence
+from ipmsm_can.estimation.observers.kinds import GES
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.node import Tracked
@@ -89,9 +90,10 @@ def test_a_filled_sample_that_leads_to_one_is_marked() -> None:
     assert (run.doubt & CLIPPED != 0).tolist() == [False, True, True, True, False, False]
 
 
-def follow(protocol: Protocol, frames: FrameBlock, alpha: float = 20.0, edges: tuple[int, ...] = ()
-           ) -> tuple[Companion, list[Tracked]]:
-    companion = Companion([config_from({"motor": {"preset": "m2"}, "observer": {"alpha": alpha}})], protocol, False)
+def follow(protocol: Protocol, frames: FrameBlock, alpha: float = 20.0, edges: tuple[int, ...] = (),
+           kind: str = "ges") -> tuple[Companion, list[Tracked]]:
+    config = config_from({"motor": {"preset": "m2"}, "observer": {"kind": kind, "alpha": alpha}})
+    companion = Companion([config], protocol, False)
     parts: list[Tracked] = []
     for a, b in pairwise([0, *edges, len(frames)]):
         parts += companion.feed(frames.take(slice(a, b)))
@@ -118,10 +120,10 @@ def overdriven(fd: bool, v_max: float = 76.0) -> tuple[Protocol, FrameBlock, NDA
 
 
 @pytest.mark.parametrize("fd", [False, True])
-@pytest.mark.parametrize("alpha", [5.0, 20.0])
-def test_an_angle_built_on_cut_off_voltages_is_never_valid(fd: bool, alpha: float) -> None:
+@pytest.mark.parametrize(("kind", "alpha"), [("ges", 5.0), ("ges", 20.0), ("riccati", 100.0), ("riccati", 20.0)])
+def test_an_angle_built_on_cut_off_voltages_is_never_valid(fd: bool, kind: str, alpha: float) -> None:
     protocol, frames, theta = overdriven(fd)
-    companion, tracked = follow(protocol, frames, alpha)
+    companion, tracked = follow(protocol, frames, alpha, kind=kind)
     flags = flags_of(tracked)
     clipped = np.concatenate([t.run.doubt for t in tracked]) & CLIPPED != 0
     error = error_of(tracked, theta)
@@ -186,7 +188,7 @@ def test_the_hold_by_hand(gain: int) -> None:
     for a, b in pairwise([0, *sorted(set(cuts)), n]):
         clipping.hold_block(clipped[a:b], np.ascontiguousarray(regression[:, a:b]),
                             np.ascontiguousarray(flux[:, a:b]), np.ascontiguousarray(angle[:, a:b]), alpha, T_s,
-                            state, found[a:b])
+                            GES, state, found[a:b])
     # once over, it is over until the next one
     for k in range(1, n):
         if not clipped[k] and expected[k - 1] == 0xFF:
