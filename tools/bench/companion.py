@@ -25,8 +25,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("channel")
     parser.add_argument("--silent", action="store_true", help="only listen")
+    parser.add_argument("--observer", default="riccati", help="its kind")
     args = parser.parse_args()
-    config = config_from({"motor": {"preset": "m2"}, "injection": {"enabled": False}})
+    config = config_from({"motor": {"preset": "m2"}, "observer": {"kind": args.observer},
+                          "injection": {"enabled": False}})
     warm_up_companion([config], Protocol())
     companion = Companion([config], Protocol(), transmit=not args.silent)
     stopping = False
