@@ -1,7 +1,6 @@
 """The C library on a real SocketCAN interface: drive_stub and `ipmsm-can run`, and a forger as the third.
 
-What the drive prints is held against what somebody else on the bus heard.  A longer run of the first test, and the
-one with a killed companion:
+What the drive prints is held against what somebody else on the bus heard.  A longer run of the first test:
 `IPMSM_CAN_SECONDS=60 tools/vcan/run .venv/bin/python -m pytest tests/vcan/test_firmware.py`.
 """
 
@@ -154,8 +153,6 @@ def test_nothing_is_lost(program: str, config: Path, tmp_path: Path, options: tu
     assert 0.0 < max(errors[1:]) < 1.0
 
 
-@pytest.mark.skipif("IPMSM_CAN_SECONDS" not in os.environ,
-                    reason="waits for minutes where drive and companion share one slow processor: a run of its own")
 def test_a_killed_companion_and_the_next_one(program: str, config: Path, tmp_path: Path) -> None:
     """Killed while the drive probes: probing ends by the time to live and the angle is refused; a new companion
     finds the rotor again and probes again."""
