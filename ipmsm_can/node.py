@@ -33,6 +33,7 @@ from ipmsm_can.wire.protocol import (
     MessageKind,
     ObserverKind,
     Protocol,
+    Waveform,
 )
 from ipmsm_can.wire.receive import SampleReceiver
 from ipmsm_can.wire.sequence import SampleRun
@@ -41,6 +42,9 @@ STALE_AFTER_NS = 50_000_000
 """Silence of the drive [ns] after which nothing is claimed any more."""
 STARTUP_PERIOD = 0.005
 """Time between commands [s] while the start-up waits for what they bring about."""
+PULSES_TIME_TO_LIVE = 0.03
+"""Time to live of polarity pulses [s], or the waveform's if that is less: at their current no drive is to be without
+orders for long."""
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
 STATUS_VERSION = 1
@@ -308,8 +312,15 @@ class Node:
         view = self.view
         return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
                                      self._fresh(now_ns), self.running,
-                                     None if startup is None else startup.pulses,
+                                     self._pulses(),
                                      startup is not None and startup.phase is Phase.REFUSED)
+
+    def _pulses(self) -> Command | None:
+        wanted = None if self.startup is None else self.startup.pulses
+        if wanted is None:
+            return None
+        return Command(Waveform.POLARITY_PULSES, wanted.amplitude, wanted.frequency, wanted.axis,
+                       min(self.config.injection.time_to_live, PULSES_TIME_TO_LIVE))
 
     def _fresh(self, now_ns: int) -> bool:
         return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS

@@ -1,26 +1,35 @@
-"""Which end of a known axis is the magnet's north: the unequal answer of saturating iron, and how sure it is.
+"""What a window of samples at standstill says of the rotor: its axis, and which end of the axis is north.
 
-With the rotor at rest, flux along +d adds to the magnet's and drives the iron into saturation, flux along -d
-relieves it, so the d current is a bent function of the d flux.  Over a window of n samples, whole periods of the
-probing signal, the current along the axis is fitted by least squares to the flux behind the resistance,
+Over a window the flux behind the resistance, lambda = sum T_s (v - R i) from the window's start, and the current
+are fitted to each other by least squares.  Nothing else about the probing signal has to be known, neither its
+waveform nor its frequency, and it may rise and fall meanwhile; tau, time, takes up what a constant voltage error
+makes of lambda.
 
-    i = c_0 + c_1 tau + c_2 f + c_3 f^2,    f = sum T_s (v - R i) along the axis from the window's start
+Axis, with complex space vectors as in `observers.probing`, a = L_s/(L_d L_q) from the motor's data:
 
-tau, time, takes up what a constant voltage error makes of f.  A positive c_3 says that the axis points north.
-Resistance, inductance and dead time err odd in f and leave c_3 alone; a shift of f or i leaves it alone as well.
-The windows' c_3 are averaged by their variances, from the residual or the sensor's noise, whichever is more, times
-the scatter of the windows where that is more than it should be.  As a number without a unit:
+    i - a lambda = c_0 + c_1 tau + b conj(lambda),    b = -(L_0/2) exp(2j theta)/(L_d L_q),    theta modulo pi
 
-    asymmetry a = 2 c_3 L_d (L_d I)        the change of 1/L_d from no flux to that of the current I, in shares
+North, with the parts of current and flux along that axis: flux along +d adds to the magnet's and drives the iron
+into saturation, flux along -d relieves it, so the d current is a bent function of the d flux,
 
-Decision: |a| beyond SIGNIFICANT standard deviations and beyond LEAST_ASYMMETRY, below which wrong samples rather
-than iron may be at work.  Refused once the standard deviation is so small (RESOLVED) that an asymmetry worth the
+    i = c_0 + c_1 tau + c_2 f + c_3 f^2
+
+and a positive c_3 says that the axis points north.  Resistance, inductance and dead time err odd in f and leave
+c_3 alone; a shift of f or i leaves it alone as well.  The windows' c_3 are averaged by their variances, from the
+residual or the sensor's noise, whichever is more, times the scatter of the windows where that is more than it
+should be.  As a number without a unit:
+
+    asymmetry A = 2 c_3 L_d (L_d I)        the change of 1/L_d from no flux to that of the current I, in shares
+
+Decision: |A| beyond SIGNIFICANT standard deviations and beyond LEAST_ASYMMETRY, below which wrong samples rather
+than iron may be at work.  Equal once the standard deviation is so small (RESOLVED) that an asymmetry worth the
 name would have shown: a machine with linear magnetics answers equally, and nothing at standstill can tell its
 north from its south.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from enum import IntEnum
 
@@ -36,20 +45,26 @@ LEAST_ASYMMETRY = 0.02
 RESOLVED = 0.005
 LEAST_WINDOWS = 4
 _TERMS = 4
+_ALIEN = 2.5
+"""How far the saliency seen may be off the motor's, either way, for the axis to be believed."""
 _ASTRAY = 0.3
 """Swing of the flux across the axis, as a share of that along it, beyond which a window does not count: with the
 other waveforms the flux across saturates the axis most where that along it is least."""
 
 STATE = np.dtype([
-    # axis as a unit vector; flux unit [Wb]; window length
-    ("axis_a", "f8"), ("axis_b", "f8"), ("unit", "f8"), ("n", "i8"),
-    ("count", "i8"), ("broken", "i8"), ("flux", "f8"),
+    ("T_s", "f8"), ("R", "f8"), ("mean", "f8"), ("difference", "f8"), ("unit", "f8"), ("n", "i8"),
+    # pulse axis as a unit vector
+    ("axis", "c16"),
+    ("count", "i8"), ("broken", "i8"), ("started", "i8"),
+    ("i", "c16"), ("first", "c16"), ("flux", "c16"),
+    # normal equations of the axis and of the bend
+    ("axis_normal", "c16", (3, 3)), ("axis_right", "c16", (3,)), ("axis_square", "f8"),
     ("normal", "f8", (_TERMS, _TERMS)), ("right", "f8", (_TERMS,)), ("square", "f8"),
-    # what else the window shows: flux increments, current at its ends, largest current and voltage
+    # swing of the flux along and across, largest current and voltage
     ("along_low", "f8"), ("along_high", "f8"), ("across_low", "f8"), ("across_high", "f8"),
-    ("sum_a", "f8"), ("sum_b", "f8"), ("first_a", "f8"), ("first_b", "f8"), ("last_a", "f8"), ("last_b", "f8"),
     ("peak", "f8"), ("voltage", "f8"),
 ])
+_OF_A_WINDOW = STATE.names[STATE.names.index("flux"):] if STATE.names else ()
 
 
 class Verdict(IntEnum):
@@ -61,71 +76,103 @@ class Verdict(IntEnum):
     EQUAL = 2
 
 
-def new_state(unit: float, n: int) -> NDArray[np.void]:
-    """Record array (1,) of STATE; unit: flux [Wb] that f is counted in; n: samples of a window."""
+def new_state(motor: Motor, sample_rate: float, unit: float, n: int) -> NDArray[np.void]:
+    """Record array (1,) of STATE; sample_rate [Hz]; unit: flux [Wb] that f is counted in; n: samples of a window."""
     state = np.zeros(1, STATE)
-    state["axis_a"] = 1.0
-    state["unit"] = unit
-    state["n"] = n
+    product = motor.L_d * motor.L_q
+    for name, value in {"T_s": 1.0 / sample_rate, "R": motor.R, "mean": motor.L_s / product,
+                        "difference": 0.5 * motor.L_0 / product, "unit": unit, "n": n, "axis": 1.0}.items():
+        state[name] = value
     return state
-
-
-def set_axis(state: NDArray[np.void], angle: float) -> None:
-    """Look along `angle` [rad electrical] from the next window on."""
-    state["axis_a"], state["axis_b"] = math.cos(angle), math.sin(angle)
-    begin_window(state)
 
 
 def begin_window(state: NDArray[np.void]) -> None:
     """Empty the sums: the next sample is the first of a window."""
-    for name in ("count", "broken", "flux", "normal", "right", "square", "along_low", "along_high", "across_low",
-                 "across_high", "sum_a", "sum_b", "peak", "voltage"):
+    for name in ("count", "broken", *_OF_A_WINDOW):
         state[name] = 0
 
 
 @kernel
-def window_block(samples: NDArray[np.float64], regression: NDArray[np.float64], filled: NDArray[np.uint8],
-                 state: NDArray[np.void]) -> None:
-    """Add samples to the window; never more than are missing in it.
+def window_block(samples: NDArray[np.float64], filled: NDArray[np.uint8], state: NDArray[np.void]) -> None:
+    """Add samples to the window; the caller sees to it that there are never more than are missing in it.
 
-    samples: float64 (4, N).  regression: float64 (7, N), of which the flux increments are read.  filled: uint8 (N,),
-    1 where a sample is only interpolated: the window then says nothing, for nobody knows what the voltage was.
+    samples: float64 (4, N), as for the regression.  filled: uint8 (N,), 1 where a sample is only interpolated: the
+    window then says nothing, for nobody knows what the voltage was.
     """
     st = state[0]
     row = np.empty(_TERMS)
+    axis_row = np.empty(3, np.complex128)
     row[0] = 1.0
+    axis_row[0] = 1.0
+    back = st.axis.conjugate()
     for k in range(samples.shape[1]):
-        i_a = samples[0, k]
-        i_b = samples[1, k]
+        i = complex(samples[0, k], samples[1, k])
+        v = complex(samples[2, k], samples[3, k])
         if st.count == 0:
-            st.first_a = i_a
-            st.first_b = i_b
+            st.first = i
         else:
-            d_a = regression[3, k]
-            d_b = regression[4, k]
-            st.flux += (d_a * st.axis_a + d_b * st.axis_b) / st.unit
-            st.sum_a += d_a
-            st.sum_b += d_b
-            across = (st.sum_b * st.axis_a - st.sum_a * st.axis_b) / st.unit
-            st.along_low = min(st.along_low, st.flux)
-            st.along_high = max(st.along_high, st.flux)
-            st.across_low = min(st.across_low, across)
-            st.across_high = max(st.across_high, across)
-        st.last_a = i_a
-        st.last_b = i_b
+            st.flux += st.T_s * (v - 0.5 * st.R * (st.i + i)) / st.unit
+        st.i = i
         st.broken |= filled[k]
-        st.peak = max(st.peak, math.hypot(i_a, i_b))
-        st.voltage = max(st.voltage, math.hypot(samples[2, k], samples[3, k]))
-        i = i_a * st.axis_a + i_b * st.axis_b
-        row[1] = st.count / st.n - 0.5
-        row[2] = st.flux
-        row[3] = st.flux * st.flux
+        st.peak = max(st.peak, abs(i))
+        st.voltage = max(st.voltage, abs(v))
+        tau = st.count / st.n - 0.5
+        st.count += 1
+
+        y = i - st.mean * st.unit * st.flux
+        axis_row[1] = tau
+        axis_row[2] = st.flux.conjugate()
+        for r in range(3):
+            for c in range(3):
+                st.axis_normal[r, c] += axis_row[r].conjugate() * axis_row[c]
+            st.axis_right[r] += axis_row[r].conjugate() * y
+        st.axis_square += y.real * y.real + y.imag * y.imag
+
+        along = (st.flux * back).real
+        across = (st.flux * back).imag
+        st.along_low = min(st.along_low, along)
+        st.along_high = max(st.along_high, along)
+        st.across_low = min(st.across_low, across)
+        st.across_high = max(st.across_high, across)
+        current = (i * back).real
+        row[1] = tau
+        row[2] = along
+        row[3] = along * along
         for r in range(_TERMS):
             for c in range(_TERMS):
                 st.normal[r, c] += row[r] * row[c]
-            st.right[r] += row[r] * i
-        st.square += i * i
-        st.count += 1
+            st.right[r] += row[r] * current
+        st.square += current * current
+
+
+def axis(state: NDArray[np.void], noise: float) -> tuple[float, float]:
+    """(angle modulo pi, its 1-sigma) [rad electrical] of a full window; noise [A rms], of the sensor.
+
+    (0, inf) where the window has nothing to say, or shows a saliency that is not the motor's.
+    """
+    st = state[0]
+    n, model = int(st["count"]), abs(float(st["difference"])) * float(st["unit"])
+    if st["broken"] or n <= _TERMS or model == 0.0:
+        return 0.0, math.inf
+    try:
+        inverse = np.linalg.inv(st["axis_normal"])
+    except np.linalg.LinAlgError:
+        return 0.0, math.inf
+    fit = inverse @ st["axis_right"]
+    left_over = (float(st["axis_square"]) - float((np.conj(st["axis_right"]) @ fit).real)) / (2 * (n - 3))
+    variance = max(noise * noise, left_over) * float(inverse[2, 2].real)
+    b = complex(fit[2])
+    if not (math.isfinite(variance) and variance > 0.0 and 1.0 / _ALIEN < abs(b) / model < _ALIEN):
+        return 0.0, math.inf
+    return 0.5 * cmath.phase(b if st["difference"] < 0.0 else -b), 0.5 * math.sqrt(variance) / model
+
+
+def back_emf(state: NDArray[np.void], theta: float, motor: Motor) -> complex:
+    """Mean voltage [V] over a full window that neither resistance nor inductance explains, at the axis theta [rad]."""
+    st = state[0]
+    di = complex(st["i"] - st["first"])
+    own = motor.L_s * di + 0.5 * motor.L_0 * cmath.exp(2j * theta) * di.conjugate()
+    return complex((st["unit"] * st["flux"] - own) / (st["T_s"] * (st["count"] - 1)))
 
 
 def curvature(state: NDArray[np.void], noise: float) -> tuple[float, float]:

@@ -14,8 +14,6 @@ from ipmsm_can.wire.protocol import InjectionReason, InjectionState, Waveform
 
 OFF_REPEATS = 3
 """How often "off" is said after injection ended, so that one lost frame does not matter."""
-PULSES_TIME_TO_LIVE = 0.03
-"""Time to live of polarity pulses [s]: at their current nobody is to be without orders for long."""
 SETTLING = 0.06
 """How long after polarity pulses the measured current is not that of the waveform [s]."""
 _RECOVERY = 0.1
@@ -103,15 +101,15 @@ class InjectionScheduler:
         return s.speed_on, s.excitation_on
 
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
-               fresh: bool, running: bool = True, pulses: tuple[float, float] | None = None,
+               fresh: bool, running: bool = True, pulses: Command | None = None,
                unknowable: bool = False) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.
 
         elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
         electrical] of the estimate.  current: measured high-frequency current [A peak].  fresh: samples
         are coming in.  running: the inverter applies the voltage it reports, as far as is known.
-        pulses: amplitude [V peak] and axis [rad electrical] of polarity pulses, made instead of the waveform where
-        that may be injected.  unknowable: the polarity was asked for in vain.
+        pulses: polarity pulses, asked for instead of the waveform where that may be injected.  unknowable: the
+        polarity was asked for in vain.
         """
         s = self.settings
         if self.state is InjectionState.DISABLED:
@@ -121,8 +119,7 @@ class InjectionScheduler:
             self._off_left = OFF_REPEATS
             self._settling = SETTLING
             self._enter(InjectionState.POLARITY_PULSES, InjectionReason.POLARITY_UNKNOWN)
-            return Command(Waveform.POLARITY_PULSES, pulses[0], s.frequency, pulses[1],
-                           min(s.time_to_live, PULSES_TIME_TO_LIVE))
+            return pulses
         if unknowable and reason is InjectionReason.LOW_SPEED:
             reason = InjectionReason.POLARITY_UNKNOWABLE
         if self._settling > 0.0:
