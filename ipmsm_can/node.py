@@ -121,6 +121,8 @@ class Node:
         self.next_status = _AT_ONCE
         """When CompanionStatus is due [ns]."""
         self._next_command: int | None = None
+        self._probing_axis = 0.0
+        """Last angle [rad electrical] that was worth turning the probing signal to: each jump costs extra current."""
         self.position_counter = 0
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index
@@ -310,7 +312,9 @@ class Node:
         late = max(0, now_ns - self._next_command)
         self._next_command = now_ns + round(period * 1e9) - min(late, round(0.5e9 * period))
         view = self.view
-        return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
+        if view.flags & confidence.LOCKED:
+            self._probing_axis = view.theta
+        return self.scheduler.update(period, view.omega, view.excitation, self._probing_axis, view.hf_current,
                                      self._fresh(now_ns), self.running,
                                      self._pulses(),
                                      startup is not None and startup.phase is Phase.REFUSED)

@@ -192,6 +192,7 @@ class StartUp:
         elif self.phase is Phase.PULSES:
             self._track(theta, sigma)
             self._judge_pulses(still)
+            self._look_along(self.angle)  # the pulses show the axis much better than what went before
         else:
             self._judge_known(still, known, theta, sigma)
 
@@ -203,7 +204,7 @@ class StartUp:
         self._axis_sum += weight * cmath.exp(2j * theta)
         if (self._axis_windows >= _AXIS_WINDOWS and self._axis_weight * _AXIS_SIGMA**2 > 1.0
                 and abs(self._axis_sum) > _COHERENT * self._axis_weight):
-            self._axis = self.angle = 0.5 * cmath.phase(self._axis_sum)
+            self.angle = 0.5 * cmath.phase(self._axis_sum)
             self.sigma = math.hypot(_MODEL_SIGMA, self._axis_weight**-0.5)
             self._to(Phase.PULSES)
 
@@ -250,15 +251,13 @@ class StartUp:
 
     def _judge_known(self, still: bool, known: bool, theta: float, sigma: float) -> None:
         measured = self._track(theta, sigma)
-        if measured is None:
-            self._lost += 1
-            if self._lost > _LOST_S * self._rate / self.n:
-                self._to(Phase.WATCH)
-            return
-        self._lost = 0
-        if still and known:
+        self._lost = 0 if measured is not None else self._lost + 1
+        if not still or self._lost > _LOST_S * self._rate / self.n:
+            # Turning, the observer sees more than the axis shows, which could come back on the wrong branch.
+            self._to(Phase.WATCH)
+        elif measured is not None and known:
             self.estimator.take_angle(measured, math.hypot(sigma, _MODEL_SIGMA))
-        elif still:
+        elif measured is not None:
             self.estimator.take_angle(self.angle, self.sigma)
 
     # Changes of phase
@@ -269,13 +268,17 @@ class StartUp:
             self._begin_axis()
         elif phase is Phase.PULSES:
             self.evidence.forget()
-            self._window["axis"] = cmath.exp(1j * self._axis)
+            self._look_along(self.angle)
             triangle = 4.0 * self.frequency * self._motor.L_d  # V per A of its peak
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
             self._last_peak = 0.0
             self._windows_left = round(_PULSES_S * self._rate / self.n)
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0
+
+    def _look_along(self, axis: float) -> None:
+        self._axis = axis
+        self._window["axis"] = cmath.exp(1j * axis)
 
     def _begin_axis(self) -> None:
         self._axis_windows, self._axis_weight, self._axis_sum = 0, 0.0, 0j

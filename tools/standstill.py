@@ -30,7 +30,7 @@ from ipmsm_can.startup import Phase
 from ipmsm_can.wire.protocol import Protocol, Waveform
 
 RATE = 5000.0
-PROBING: dict[str, dict[str, float]] = {"m1": {"amplitude": 9.0}, "m2": {"amplitude": 4.5}}
+PROBING: dict[str, dict[str, float]] = {"m1": {"amplitude": 9.0}, "m2": {"amplitude": 4.2}}
 """Amplitude [V peak] that keeps the continuous probing current below 15 % of rated; the default, 6 V, does not
 on m2."""
 _NOT_PROBING_S = 0.03
