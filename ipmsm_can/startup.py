@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from ipmsm_can.estimation import confidence, polarity
 from ipmsm_can.estimation.estimator import FORGET_AFTER, EstimateBlock, Estimator
-from ipmsm_can.estimation.observers.common import window_length
 from ipmsm_can.estimation.polarity import Verdict, window_block
 from ipmsm_can.motor import Motor
 
@@ -37,11 +36,12 @@ _LARGEST_STEP = 2.0
 _SETTLED = 0.03
 _APPLIED = 0.5
 _LEAST_SAMPLES = 16
+_LEAST_PERIOD = 4
 _MOST_HALVINGS = 3
-_AXIS_SIGMA = math.radians(4.0)
+_AXIS_SIGMA = math.radians(7.0)
 _WINDOW_SIGMA = math.radians(15.0)
-_MODEL_SIGMA = math.radians(1.5)
-"""What the axis of a window may be wrong by besides noise: saturation, inductances."""
+_MODEL_SIGMA = math.radians(1.0)
+"""What the axis of a window may be wrong by besides noise and voltage: saturation, inductances."""
 _DRIFT_SIGMA = math.radians(1.0)
 """What the rotor may move in a window while it stands still."""
 _JUMP = math.radians(30.0)
@@ -95,15 +95,18 @@ class StartUp:
         self.angle, self.sigma = 0.0, math.inf
         self.evidence = polarity.Evidence(motor, settings.current)
         rate = estimator.sample_rate
-        self.frequency = pulse_frequency(motor, settings)
-        window = window_length(self.frequency, rate)
-        self.n = window * -(-_LEAST_SAMPLES // window) if window else 0
+        period = pulse_period(motor, settings, rate)
+        self.frequency = rate / period if period else 0.0
+        self.n = period * max(2, -(-_LEAST_SAMPLES // period)) if period else 0
         self._axis = 0.0
         self._amplitude = 0.0
         self._motor = motor
         self._rate = rate
         self._noise = estimator.settings.current_noise
-        self._still_below = 2.0 * estimator.settings.voltage_uncertainty
+        voltage_uncertainty = estimator.settings.voltage_uncertainty
+        self._still_below = 2.0 * voltage_uncertainty
+        # An error of the voltage turns the axis by half its share, times what b is smaller than a.
+        self._turned = 0.5 * voltage_uncertainty * motor.L_s / abs(0.5 * motor.L_0) if motor.L_0 else math.inf
         self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n)
         self._back_emf = 0j
         self._count = 0
@@ -150,7 +153,7 @@ class StartUp:
                 window_block(part, filled[begin:end], self._window)
             self._count += end - begin
             if self._count == self.n:
-                self._judge(int(parts[-1].flags[-1]))
+                self._judge(int(parts[-1].flags[-1]), float(parts[-1].sigma[-1]))
                 self._begin_window()
             begin = end
         return parts[0] if len(parts) == 1 else _joined(parts)
@@ -169,7 +172,7 @@ class StartUp:
 
     # At the end of each window
 
-    def _judge(self, flags: int) -> None:
+    def _judge(self, flags: int, known_to: float) -> None:
         self._last_flags = flags
         known = flags & confidence.POLARITY_KNOWN != 0
         if self.phase is Phase.WATCH:
@@ -179,6 +182,7 @@ class StartUp:
                 self._to(Phase.AXIS)
             return
         theta, sigma = polarity.axis(self._window, self._noise)
+        sigma = math.hypot(sigma, _MODEL_SIGMA, self._turned / max(float(self._window["voltage"][0]), 1e-9))
         if not self._window["broken"][0]:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)
         still = abs(self._back_emf) < self._still_below
@@ -194,7 +198,7 @@ class StartUp:
             self._judge_pulses(still)
             self._look_along(self.angle)  # the pulses show the axis much better than what went before
         else:
-            self._judge_known(still, known, theta, sigma)
+            self._judge_known(still, known_to if known else math.inf, theta, sigma)
 
     def _find_axis(self, theta: float, sigma: float) -> None:
         """Average the axes of successive windows until they are sure enough."""
@@ -205,19 +209,23 @@ class StartUp:
         if (self._axis_windows >= _AXIS_WINDOWS and self._axis_weight * _AXIS_SIGMA**2 > 1.0
                 and abs(self._axis_sum) > _COHERENT * self._axis_weight):
             self.angle = 0.5 * cmath.phase(self._axis_sum)
-            self.sigma = math.hypot(_MODEL_SIGMA, self._axis_weight**-0.5)
+            self.sigma = sigma
             self._to(Phase.PULSES)
 
     def _track(self, theta: float, sigma: float) -> float | None:
-        """Follow the axis from window to window on its branch; returns the window's angle, None if not believed."""
+        """Follow the axis from window to window on its branch; returns the window's angle, None if not believed.
+
+        What windows are wrong by besides noise they have in common, so the angle never counts as better than the
+        best of them.
+        """
         self.sigma = math.hypot(self.sigma, _DRIFT_SIGMA)
         off = math.remainder(theta - self.angle, math.pi)
         if not (sigma < _WINDOW_SIGMA and abs(off) < _JUMP):
             return None
-        gain = self.sigma**2 / (self.sigma**2 + sigma**2 + _MODEL_SIGMA**2)
         measured = self.angle + off
-        self.angle = math.remainder(self.angle + gain * off, 2.0 * math.pi)
-        self.sigma *= math.sqrt(1.0 - gain)
+        if sigma < self.sigma:
+            self.angle = math.remainder(self.angle + (1.0 - (sigma / self.sigma) ** 2) * off, 2.0 * math.pi)
+            self.sigma = sigma
         return measured
 
     def _judge_pulses(self, still: bool) -> None:
@@ -249,16 +257,16 @@ class StartUp:
             peak = 0.0  # the next two windows are on their way
         self._last_peak = peak
 
-    def _judge_known(self, still: bool, known: bool, theta: float, sigma: float) -> None:
+    def _judge_known(self, still: bool, known_to: float, theta: float, sigma: float) -> None:
         measured = self._track(theta, sigma)
         self._lost = 0 if measured is not None else self._lost + 1
         if not still or self._lost > _LOST_S * self._rate / self.n:
             # Turning, the observer sees more than the axis shows, which could come back on the wrong branch.
             self._to(Phase.WATCH)
-        elif measured is not None and known:
-            self.estimator.take_angle(measured, math.hypot(sigma, _MODEL_SIGMA))
-        elif measured is not None:
+        elif measured is not None and not math.isfinite(known_to):
             self.estimator.take_angle(self.angle, self.sigma)
+        elif measured is not None and sigma < known_to:
+            self.estimator.take_angle(measured, sigma)
 
     # Changes of phase
 
@@ -284,14 +292,20 @@ class StartUp:
         self._axis_windows, self._axis_weight, self._axis_sum = 0, 0.0, 0j
 
 
-def pulse_frequency(motor: Motor, settings: StartUpSettings) -> float:
-    """The highest frequency [Hz] at which the voltage allowed reaches the current aimed at, so many octaves down."""
+def pulse_period(motor: Motor, settings: StartUpSettings, sample_rate: float) -> int:
+    """Period of the pulses in samples, 0 where that would be too few: so long that the voltage allowed reaches the
+    current aimed at, in whole octaves below the highest frequency, at most three.
+
+    An even number, so that what is odd in the current, such as dead time, is so in the samples, too; an odd number
+    would turn it into a difference between + and -.
+    """
     frequency = settings.frequency
     for _ in range(_MOST_HALVINGS):
         if 4.0 * frequency * motor.L_d * TARGET * settings.current <= settings.amplitude:
             break
         frequency *= 0.5
-    return frequency
+    period = 2 * round(0.5 * sample_rate / frequency)
+    return period if period >= _LEAST_PERIOD else 0
 
 
 def _joined(parts: list[EstimateBlock]) -> EstimateBlock:

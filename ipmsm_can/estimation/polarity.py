@@ -41,7 +41,7 @@ from ipmsm_can.motor import Motor
 
 SIGNIFICANT = 6.0
 """Standard deviations: one wrong decision in 5e8 on Gaussian noise."""
-LEAST_ASYMMETRY = 0.02
+LEAST_ASYMMETRY = 0.03
 RESOLVED = 0.005
 LEAST_WINDOWS = 4
 _TERMS = 4
