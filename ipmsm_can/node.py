@@ -43,8 +43,8 @@ STALE_AFTER_NS = 50_000_000
 STARTUP_PERIOD = 0.005
 """Time between commands [s] while the start-up waits for what they bring about."""
 PULSES_TIME_TO_LIVE = 0.03
-"""Time to live of polarity pulses [s], or the waveform's if that is less: at their current no drive is to be without
-orders for long."""
+"""Time to live of polarity pulses [s], or the waveform's if that is less: at their current no drive is to be
+without orders for long."""
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
 STATUS_VERSION = 1
@@ -122,7 +122,7 @@ class Node:
         """When CompanionStatus is due [ns]."""
         self._next_command: int | None = None
         self._probing_axis = 0.0
-        """Last angle [rad electrical] that was worth turning the probing signal to: each jump costs extra current."""
+        """Last angle [rad electrical] worth turning the probing signal to: each jump costs extra current."""
         self.position_counter = 0
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index

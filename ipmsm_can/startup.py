@@ -114,6 +114,7 @@ class StartUp:
         self._tries = 0
         self._lost = 0
         self._last_flags = 0
+        self._last_peak = 0.0
         self._begin_axis()
 
     @property

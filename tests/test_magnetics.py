@@ -117,7 +117,7 @@ def test_energy_balance_of_the_whole_machine() -> None:
 
     def energy() -> float:
         d, q, _, _ = dq()
-        return 1.5 * stored_energy(d, q, m) + 0.5 * M2.J * x[2] ** 2
+        return 1.5 * stored_energy(d, q, m) + 0.5 * M2.J * float(x[2]) ** 2
 
     start, largest = energy(), 0.0
     for k in range(8000):

@@ -22,7 +22,7 @@ from ipmsm_can.bus.cosim import CoSimulation
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
-from ipmsm_can.drive.profile import constant
+from ipmsm_can.drive.profile import Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.motor import PRESETS
@@ -60,8 +60,8 @@ CASES = (
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """One run.  valid_at: first valid angle [s], inf without.  error: at the end, wrong: largest while valid, moved:
-    of the rotor [deg electrical].  probing, pulses: largest true current [A peak] as a share of rated.
+    """One run.  valid_at: first valid angle [s], inf without.  error: at the end, wrong: largest while valid,
+    moved: of the rotor [deg electrical].  probing, pulses: largest true current [A peak] as a share of rated.
     phase: where the start-up stood at the end."""
 
     seed: int
@@ -75,19 +75,31 @@ class Result:
     phase: Phase
 
 
-def run(case: Case, seed: int, seconds: float = 0.2, **injection: Any) -> Result:
-    """One start from a random angle."""
+def cosimulation(case: Case, seed: int, transmit: bool, injection: dict[str, Any], speed: float = 0.0,
+                 after: float = 0.0) -> CoSimulation:
+    """A drive at an angle nobody knows, drawn from the seed, and its companion.
+
+    speed: the profile's, after the time `after` [s] at rest [rad/s mechanical].
+    """
     motor = PRESETS[case.motor]
     protocol = Protocol()
     theta_0 = float(np.random.default_rng(seed).uniform(-math.pi, math.pi))
     # a torque limit of nothing: the drive does not know its angle yet and holds its current at zero
-    parameters = DriveParameters(sample_rate=RATE, saturation=case.saturation, torque_limit=1e-6, **dict(case.drive))
-    simulation = DriveSimulation(motor, parameters, constant(0.0, duration=seconds), theta_0, seed)
+    settings = {"sample_rate": RATE, "saturation": case.saturation, "torque_limit": 1e-6, **dict(case.drive)}
+    points = ((0.0, 0.0), (after, 0.0), (after + 0.2, speed)) if after else ((0.0, speed),)
+    simulation = DriveSimulation(motor, DriveParameters(**settings), Profile(points, duration=after + 1.0), theta_0,
+                                 seed)
     drive = DriveNode(protocol, 0, simulation, DriveNodeSettings())
     config = config_from({"motor": {"preset": case.motor}, "observer": {"kind": case.observer},
                           "injection": {**PROBING[case.motor], **injection}})
-    companion = Companion([config], protocol, transmit=True)
-    recording = CoSimulation([drive], companion).run(seconds)
+    return CoSimulation([drive], Companion([config], protocol, transmit))
+
+
+def run(case: Case, seed: int, seconds: float = 0.2, **injection: Any) -> Result:
+    """One start from a random angle."""
+    motor = PRESETS[case.motor]
+    cosim = cosimulation(case, seed, True, injection)
+    recording = cosim.run(seconds)
     truth, tracked = recording.truth[0], recording.tracked[0]
     counter = np.concatenate([t.run.counter for t in tracked])
     theta = np.concatenate([t.estimate.angle[0] for t in tracked])
@@ -100,7 +112,7 @@ def run(case: Case, seed: int, seconds: float = 0.2, **injection: Any) -> Result
     probing = np.ones(current.size, bool)
     if pulsing.size:
         probing[pulsing[0]:pulsing[-1] + 1 + round(_NOT_PROBING_S * RATE)] = False
-    startup = companion.nodes[0].startup
+    startup = cosim.companion.nodes[0].startup
     assert startup is not None
     turned = np.degrees(np.unwrap(true) - true[0])
     return Result(seed, bool(valid[-1]), float(counter[np.argmax(valid)]) / RATE if valid.any() else math.inf,
@@ -122,10 +134,11 @@ def judge(case: Case, results: Sequence[Result]) -> tuple[str, bool]:
     limits = all(r.moved < 5.0 and r.probing <= 0.15 and r.pulses <= 1.0 for r in results)
     good = (refused if case.saturation == 0.0 else right) == n and false_claims == 0 and limits
     took = sorted(r.valid_at for r in results)
+    error = max((r.error for r in results if r.valid), default=math.nan)
+    moved, probing, pulses = (max(getattr(r, name) for r in results) for name in ("moved", "probing", "pulses"))
     line = (f"{case.name:20s} {case.observer:22s} {right:5d} {refused:7d} {false_claims:6d} "
-            f"{1e3 * took[n // 2]:5.0f} {1e3 * took[-1]:5.0f}  {max(r.error for r in results if r.valid) if right else math.nan:6.2f} "
-            f"{max(r.moved for r in results):6.2f} {100 * max(r.probing for r in results):8.1f} "
-            f"{100 * max(r.pulses for r in results):7.1f}   {'holds' if good else 'FAILS'}")
+            f"{1e3 * took[n // 2]:5.0f} {1e3 * took[-1]:5.0f} {error:7.2f} {moved:6.2f} {100 * probing:8.1f} {100 * pulses:7.1f}   "
+            f"{'holds' if good else 'FAILS'}")
     return line, good
 
 
@@ -139,8 +152,8 @@ def main(arguments: list[str] | None = None) -> int:
     chosen = parser.parse_args(arguments)
     if chosen.runs < 1 or chosen.workers < 1:
         parser.error(f"--runs is {chosen.runs} and --workers {chosen.workers}; allowed is 1 or more")
-    print(f"{chosen.runs} starts each, seeds from {chosen.seed} on; times in ms, angles in deg electrical, currents in "
-          "% of rated")
+    print(f"{chosen.runs} starts each, seeds from {chosen.seed} on; times in ms, angles in deg electrical, "
+          "currents in % of rated")
     print(f"{'case':20s} {'observer':22s} right refused  false valid  last   error  moved  probing  pulses")
     held = True
     with ProcessPoolExecutor(chosen.workers) as pool:

@@ -77,7 +77,7 @@ class Verdict(IntEnum):
 
 
 def new_state(motor: Motor, sample_rate: float, unit: float, n: int) -> NDArray[np.void]:
-    """Record array (1,) of STATE; sample_rate [Hz]; unit: flux [Wb] that f is counted in; n: samples of a window."""
+    """Record array (1,) of STATE; sample_rate [Hz]; unit: flux [Wb] that f is counted in; n: of a window."""
     state = np.zeros(1, STATE)
     product = motor.L_d * motor.L_q
     for name, value in {"T_s": 1.0 / sample_rate, "R": motor.R, "mean": motor.L_s / product,
@@ -168,7 +168,7 @@ def axis(state: NDArray[np.void], noise: float) -> tuple[float, float]:
 
 
 def back_emf(state: NDArray[np.void], theta: float, motor: Motor) -> complex:
-    """Mean voltage [V] over a full window that neither resistance nor inductance explains, at the axis theta [rad]."""
+    """Mean voltage [V] of a full window that neither resistance nor inductance explains, with the axis at theta."""
     st = state[0]
     di = complex(st["i"] - st["first"])
     own = motor.L_s * di + 0.5 * motor.L_0 * cmath.exp(2j * theta) * di.conjugate()
