@@ -137,8 +137,8 @@ def judge(case: Case, results: Sequence[Result]) -> tuple[str, bool]:
     error = max((r.error for r in results if r.valid), default=math.nan)
     moved, probing, pulses = (max(getattr(r, name) for r in results) for name in ("moved", "probing", "pulses"))
     line = (f"{case.name:20s} {case.observer:22s} {right:5d} {refused:7d} {false_claims:6d} "
-            f"{1e3 * took[n // 2]:5.0f} {1e3 * took[-1]:5.0f} {error:7.2f} {moved:6.2f} {100 * probing:8.1f} {100 * pulses:7.1f}   "
-            f"{'holds' if good else 'FAILS'}")
+            f"{1e3 * took[n // 2]:5.0f} {1e3 * took[-1]:5.0f} {error:7.2f} {moved:6.2f} "
+            f"{100 * probing:8.1f} {100 * pulses:7.1f}   {'holds' if good else 'FAILS'}")
     return line, good
 
 
