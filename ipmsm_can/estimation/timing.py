@@ -31,8 +31,9 @@ makes |U|/|V| more than twice that of an inductance, which is looked at as well.
 angle is not asked: a wrong delay may have spoiled it.
 
 Two successive windows that agree, each more than _SURE sigma and _LEAST away from the delay in use, change it: to
-a multiple of half a sample where one lies within 2 sigma, as drives that sample once or twice a period make them,
-else to a tenth.  The change falls between two windows, whatever the partition into blocks.
+a multiple of half a sample where sigma is below _FINE and one lies within 2.5 sigma, as drives that sample once or
+twice a period make them, else to a tenth.  Windows that tell more than those it was taken from refine it.  The
+change falls between two windows, whatever the partition into blocks.
 """
 
 from __future__ import annotations
@@ -59,6 +60,9 @@ MOST = 2.0
 _LEAST = 0.25
 _SURE = 3.0
 _AGREE = 0.2
+_FINE = 0.1
+_FINER = 0.8
+_LEAST_FINER = 0.15
 _FLOOR = 0.02
 _CLEAR = 100.0
 """Least ratio of the probing signal's power to what noise and dead time make of it."""
@@ -81,6 +85,7 @@ STATE = np.dtype([
     # Finding: place in the window, last current, components (axis; real, imaginary), sum of |v|^2; what came out.
     ("at", "i8"), ("started", "i8"), ("i_a", "f8"), ("i_b", "f8"), ("V", "f8", (2, 2)), ("U", "f8", (2, 2)),
     ("B", "f8", (2, 2)), ("v2", "f8"), ("found", "f8"), ("sigma", "f8"), ("candidate", "f8"),
+    ("taken_sigma", "f8"),
 ])
 
 
@@ -88,14 +93,24 @@ STATE = np.dtype([
 class VoltageDelay:
     """What is known of the delay of the voltage against the current, in samples; positive: the voltage is late.
 
-    applied: set right in the estimate.  found, sigma: measured in the last window and its 1-sigma, NaN = unknown.
-    automatic: applied follows what is found.
+    applied: set right in the estimate.  found, sigma: what the last window that could tell measured, and its
+    1-sigma; NaN = unknown so far.  automatic: applied follows what is found.
     """
 
     applied: float
     found: float
     sigma: float
     automatic: bool
+
+    @property
+    def words(self) -> str:
+        """In words; "" while nothing is known and nothing set right."""
+        measured = f"measured {self.found:+.2f} +/- {self.sigma:.2f} samples" if self.found == self.found else ""
+        if self.applied == 0.0:
+            return f"voltage in time, {measured}" if measured else ""
+        side = "late" if self.applied > 0.0 else "early"
+        text = f"voltage {side} by {abs(self.applied):g} samples, set right"
+        return f"{text} ({measured})" if measured else text
 
 
 def new_state(motor: Motor, delay: float | None, injection_frequency: float, sample_rate: float,
@@ -227,8 +242,6 @@ def _align(samples: Floats, begin: int, end: int, st: Any, out: Floats, ahead: N
 def _judge(st: Any) -> None:
     """What the window that just ended says of the delay."""
     last = st.candidate
-    st.found = math.nan
-    st.sigma = math.nan
     st.candidate = math.nan
     power = 0.0
     cross = 0.0j
@@ -248,13 +261,15 @@ def _judge(st: Any) -> None:
     st.found = delay
     st.sigma = math.sqrt(phase2) / st.step
     away = abs(delay - st.pending)
-    if away > _LEAST and away > _SURE * st.sigma:
+    finer = st.sigma < _FINER * st.taken_sigma and away > max(_LEAST_FINER, 2.0 * st.sigma)
+    if finer or away > max(_LEAST, _SURE * math.hypot(st.sigma, st.taken_sigma)):
         st.candidate = delay
         if abs(delay - last) < _AGREE:
             taken = math.floor(2.0 * delay + 0.5) / 2.0
-            if abs(delay - taken) > 2.0 * st.sigma:
+            if st.sigma > _FINE or abs(delay - taken) > 2.5 * st.sigma:
                 taken = math.floor(10.0 * delay + 0.5) / 10.0
             st.pending = min(max(taken, -MOST), MOST)
+            st.taken_sigma = st.sigma
             st.candidate = math.nan
 
 
