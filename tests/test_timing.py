@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from ipmsm_can.cli import plain, render
+from ipmsm_can.cli.monitor import _node_status
+from ipmsm_can.cli.status import BusStatus, RunStatus
+from ipmsm_can.companion import Companion
 from ipmsm_can.config import parse_config
 from ipmsm_can.config.build import drive_parameters, estimator_settings
 from ipmsm_can.drive.parameters import DriveParameters
@@ -21,6 +27,8 @@ from ipmsm_can.drive.simulation import DriveSimulation
 from ipmsm_can.estimation import confidence, speed, timing
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
+from ipmsm_can.experiments.model import Probing, Setup, Watcher
+from ipmsm_can.experiments.rig import companion_config, protocol, record
 from ipmsm_can.motor import M1, M2, Motor
 from tests.rotating import Rotating, degrees_between
 from tests.test_observers import settings
@@ -47,10 +55,15 @@ def estimator(motor: Motor = M2, kind: str = "riccati", rate: float = RATE, **ke
     return Estimator(motor, rate, settings(kind, motor, **keys))
 
 
+def times(n: int) -> Floats:
+    return np.asarray(np.arange(n) * T_S, np.float64)
+
+
 def late_samples(machine: Rotating, delay: float, n: int) -> Floats:
     """Samples of a machine in closed form whose voltage is the mean over (t_k - T - d T, t_k - d T]."""
-    t = np.arange(n) * T_S
-    ends, begins = t - delay * T_S, t - (1.0 + delay) * T_S
+    t = times(n)
+    ends: Floats = t - delay * T_S
+    begins: Floats = ends - T_S
     i = machine.current(t)
     moved = machine.flux(ends) - machine.flux(begins)
     mean_i = (machine.current(ends) - machine.current(begins)) / (1j * machine.w)
@@ -99,7 +112,7 @@ def test_the_flux_moves_by_the_voltages_that_acted_between_two_currents(lead: fl
 def test_a_delay_that_is_told_is_gone_and_untold_it_turns_the_angle(kind: str, delay: float) -> None:
     machine = Rotating(M2, 314.0, 0.0, 2.0)
     n = 10_000
-    samples, theta = late_samples(machine, delay, n), machine.theta(np.arange(n) * T_S)
+    samples, theta = late_samples(machine, delay, n), machine.theta(times(n))
     told = estimator(kind=kind, voltage_delay=delay).process(samples).angle[speed.THETA_HAT]
     untold = estimator(kind=kind, voltage_delay=0.0).process(samples).angle[speed.THETA_HAT]
     assert np.abs(degrees_between(told, theta))[-2000:].max() < 0.03
@@ -150,7 +163,7 @@ def test_samples_in_time_go_through_untouched() -> None:
 def test_a_gap_is_carried_over_with_the_delay(delay: float) -> None:
     machine = Rotating(M2, 314.0, 0.0, 2.0)
     n = 6000
-    samples, theta = late_samples(machine, delay, n), machine.theta(np.arange(n) * T_S)
+    samples, theta = late_samples(machine, delay, n), machine.theta(times(n))
     keep = np.ones(n, bool)
     keep[4000:4050] = False
     gap = np.zeros(keep.sum(), np.int64)
@@ -276,7 +289,7 @@ def test_any_partition_gives_the_same_bits_across_a_change(kind: str, cuts: list
     e = estimator(kind=kind)
     edges = sorted({0, 2600, *cuts})
     parts = [e.process(np.ascontiguousarray(samples[:, a:b]), gap[a:b])
-             for a, b in zip(edges, edges[1:], strict=False)]
+             for a, b in pairwise(edges)]
     names = ("regression", "flux", "angle", "excitation", "sigma", "flags")
     joined = b"".join(np.concatenate([getattr(p, name) for p in parts], axis=-1).tobytes() for name in names)
     assert joined == PARTITIONED[kind]
@@ -322,7 +335,25 @@ def test_a_drive_refuses_a_timing_it_cannot_make(changes: dict[str, float]) -> N
 def test_the_words() -> None:
     nan = math.nan
     assert timing.VoltageDelay(0.0, nan, nan, True).words == ""
-    assert timing.VoltageDelay(0.0, 0.04, 0.03, True).words == "voltage in time, measured +0.04 +/- 0.03 samples"
+    assert timing.VoltageDelay(0.0, 0.04, 0.03, True).words == (
+        "voltage in time (found late by +0.04 +/- 0.03 samples)")
     assert timing.VoltageDelay(-0.5, nan, nan, False).words == "voltage early by 0.5 samples, set right"
     assert timing.VoltageDelay(1.0, 1.1, 0.06, True).words == (
-        "voltage late by 1 samples, set right (measured +1.10 +/- 0.06 samples)")
+        "voltage late by 1 sample, set right (found +1.10 +/- 0.06)")
+
+
+def test_a_companion_says_what_it_set_right() -> None:
+    """From the drive's settings through the frames to what an operator reads."""
+    drive = replace(DRIVE, voltage_delay=1.0)
+    setup = Setup("m2", constant(20.0 * RPM, 2.0, 0.5), drive, probing=Probing(6.0, 400.0))
+    companion = Companion([companion_config(setup, Watcher("riccati", None, None))], protocol(), transmit=False)
+    companion.feed(record(setup).frames)
+    node = companion.nodes[0]
+    status = _node_status(node, 0.0, 0.0, 0)
+    assert re.fullmatch(r"voltage late by 1 sample, set right \(found \+1\.\d\d \+/- 0\.\d\d\)", status.timing)
+    bus = BusStatus("vcan0", 0.1, 1, 1.0, 0, 0, 0, 0, 0, 0, 0, 0, "none", math.nan, math.nan)
+    run = RunStatus("", 1.0, False, bus, (replace(status, live=True),))
+    for text in (plain.line(run), plain.summary(run), "\n".join(str(t) for t in render._node(status, 100))):
+        assert status.timing in text
+    in_time = RunStatus("", 1.0, False, bus, (replace(status, live=True, timing=""),))
+    assert "voltage" not in plain.line(in_time) + plain.summary(in_time)

@@ -105,12 +105,12 @@ class VoltageDelay:
     @property
     def words(self) -> str:
         """In words; "" while nothing is known and nothing set right."""
-        measured = f"measured {self.found:+.2f} +/- {self.sigma:.2f} samples" if self.found == self.found else ""
+        found = f"{self.found:+.2f} +/- {self.sigma:.2f}" if math.isfinite(self.found) else ""
         if self.applied == 0.0:
-            return f"voltage in time, {measured}" if measured else ""
-        side = "late" if self.applied > 0.0 else "early"
-        text = f"voltage {side} by {abs(self.applied):g} samples, set right"
-        return f"{text} ({measured})" if measured else text
+            return f"voltage in time (found late by {found} samples)" if found else ""
+        size, side = abs(self.applied), "late" if self.applied > 0.0 else "early"
+        text = f"voltage {side} by {size:g} sample{'s' if size != 1.0 else ''}, set right"
+        return f"{text} (found {found})" if found else text
 
 
 def new_state(motor: Motor, delay: float | None, injection_frequency: float, sample_rate: float,
