@@ -62,7 +62,8 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
     valid_sigma: largest 1-sigma of a valid angle [deg electrical].
     injection_frequency: of the probing signal [Hz], for the kinds injection_extraction and injection_demodulation.
     gains: the other keys of [observer] in drive.toml: alpha, gamma, initial_flux, epsilon,
-    excitation_window, speed_bandwidth, voltage_uncertainty, current_noise; numbers in SI or strings with units.
+    excitation_window, speed_bandwidth, voltage_uncertainty, current_noise, voltage_delay; numbers in SI or strings
+    with units.
 
     Raises ValueError with one sentence for shapes that do not fit, values that are not finite, an unknown
     motor, or a gain outside its range.

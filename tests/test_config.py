@@ -55,7 +55,7 @@ def test_defaults() -> None:
         "kind": "riccati", "alpha": None, "gamma": None, "initial_flux": (0.0, 0.0), "epsilon": None,
         "excitation_window": 0.1, "speed_bandwidth": 20.0, "voltage_uncertainty": 0.5, "current_noise": 0.02,
         "resistance_uncertainty": 12.0, "inductance_uncertainty": 6.0, "adapt_voltage": True,
-        "adapt_resistance": True,
+        "adapt_resistance": True, "voltage_delay": "auto",
     }
     assert config.estimate.model_dump() == {
         "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 10.0,

@@ -221,6 +221,9 @@ def _node_lines(number: int, s: NodeSummary, replay: Replay) -> list[str]:
         return [f"node {number}: no samples", lines[1]]
     lines.append(f"  lock       {_when('first locked', s.first_locked)}, locked {_share(s.locked, s.rows)}; "
                  f"{_when('first valid', s.first_valid)}, valid {_share(s.valid, s.rows)} of the samples")
+    timing = node.estimator.voltage_delay.words if node.estimator is not None else ""
+    if timing:
+        lines.append(f"  timing     {timing}")
     encoder = s.encoder
     if encoder.compared:
         lines.append(f"  encoder    error {math.degrees(encoder.rms):.3f} deg rms, "

@@ -176,6 +176,10 @@ class ObserverConfig(Section):
             "the samples tell; else they count as noise.")] = True
     adapt_resistance: Annotated[bool, Switch(
         doc="Whether riccati estimates the error of motor.R as well.")] = True
+    voltage_delay: Annotated[float | Literal["auto"], QuantityOrWord(
+        doc="How late the reported voltage is against the current; 0: as said in docs/wire.md. auto takes it for 0 "
+            "until the probing signal shows another one.", unit=units.SAMPLES, least=-2, most=2,
+        word="auto")] = "auto"
 
 
     @model_validator(mode="before")
