@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipmsm_can.bus.logs import read_log, write_log
 from ipmsm_can.bus.rows import COLUMNS
 from ipmsm_can.cli import main
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs import read_log, write_log
 from ipmsm_can.wire.protocol import Protocol
 from tests.replaying import column, config, drive_frames, rows_of, toml
 
@@ -138,7 +138,7 @@ def test_the_log_is_never_overwritten(tmp_path: Path, protocol: Protocol,
 @pytest.mark.parametrize("name", ["a.csv", "a.parquet"])
 def test_ctrl_c_loses_nothing_written(tmp_path: Path, protocol: Protocol, monkeypatch: pytest.MonkeyPatch,
                                       name: str) -> None:
-    from ipmsm_can.bus import logs
+    from ipmsm_can import logs
 
     if name.endswith("parquet"):
         pytest.importorskip("pyarrow")

@@ -66,9 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Replay; returns the exit code."""
-    from ipmsm_can.bus.logs import read_log
     from ipmsm_can.config import load_configs
     from ipmsm_can.config.build import build_protocol
+    from ipmsm_can.logs import read_log
 
     log = Path(args.log)
     configs = load_configs(args.drive)
