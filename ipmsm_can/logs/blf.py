@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
+from itertools import chain, repeat
 from pathlib import Path
 from typing import IO
 
@@ -54,7 +55,7 @@ def read_blf(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
         counts = np.zeros(k.COUNTS, np.int64)
         rest = b""
         with closing(_unpacked(source, request, outcome)) as pieces:
-            for piece in pieces:
+            for piece, done in pieces:
                 data = rest + piece if rest else piece
                 view, at = np.frombuffer(data, np.uint8), 0
                 while True:
@@ -64,7 +65,7 @@ def read_blf(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
                     outcome.passed_over = int(counts[k.PASSED_OVER])
                     if not filling.full:
                         break
-                    outcome.done = source.done
+                    outcome.done = done
                     yield filling.take()
                 rest = data[at:]
                 if counts[k.BROKEN]:
@@ -92,35 +93,35 @@ def _read_header(source: Source, request: Request) -> tuple[int, int]:
 
 
 def _start_ns(systemtime: tuple[int, ...]) -> int:
-    """Unix time of a SYSTEMTIME (year, month, day of week, day, hour, minute, second, ms); 0 if it is no time."""
+    """Unix time of a SYSTEMTIME (year, month, day of week, day, hour, minute, second, ms).
+
+    0 if it is no time, or none that int64 holds in ns (1970 to 2262).
+    """
     year, month, _, day, hour, minute, second, ms = systemtime
     try:
         start = datetime.datetime(year, month, day, hour, minute, second, ms * 1000, tzinfo=_UTC)
     except ValueError:
         return 0
-    return max(0, (start - _EPOCH) // datetime.timedelta(milliseconds=1) * 1_000_000)
+    since = (start - _EPOCH) // datetime.timedelta(milliseconds=1) * 1_000_000
+    return since if 0 <= since < 1 << 63 else 0
 
 
-def _unpacked(source: Source, request: Request, outcome: Outcome) -> Generator[bytes, None, None]:
-    """What the containers hold, in pieces of a few containers; a container that is not whole as far as it goes."""
+def _unpacked(source: Source, request: Request, outcome: Outcome) -> Generator[tuple[bytes, float], None, None]:
+    """(what a few containers hold, share of the file up to there); of a cut-off container what there is."""
     pool = ThreadPoolExecutor(1, "blf")
-    ahead: deque[Future[tuple[bytes, str]]] = deque()
+    ahead: deque[tuple[Future[tuple[bytes, str]], float]] = deque()
     try:
-        for packed in _groups(source, request, outcome):
-            ahead.append(pool.submit(_unpack, packed))
-            while len(ahead) > _AHEAD:
-                data, trouble = ahead.popleft().result()
-                yield data
+        for packed in chain(_groups(source, request, outcome), repeat(None, _AHEAD)):
+            if packed is not None:
+                ahead.append((pool.submit(_unpack, packed), source.done))
+            if ahead and (packed is None or len(ahead) > _AHEAD):
+                following, done = ahead.popleft()
+                data, trouble = following.result()
+                yield data, done
                 if trouble:
-                    outcome.problem = f"{request.path} is damaged: {trouble}; what follows is left out"
+                    outcome.problem = (outcome.problem
+                                       or f"{request.path} is damaged: {trouble}; what follows is left out")
                     return
-        while ahead:
-            data, trouble = ahead.popleft().result()
-            yield data
-            if trouble:
-                outcome.problem = (outcome.problem
-                                   or f"{request.path} is damaged: {trouble}; what follows is left out")
-                return
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -271,3 +271,13 @@ def lay_out(raw: Bytes, t_ns: Ints, start_ns: int, channel: int, out: Bytes) -> 
 
 OBJECT_BYTES = _HEADER + 84
 """Room for the largest object of `lay_out`."""
+
+
+def warm_up() -> None:
+    """Compile or load the kernel that reads, before there is anything to measure."""
+    raw, t_ns = np.zeros((1, 72), np.uint8), np.zeros(1, np.int64)
+    walk(_NOTHING, 0, 0, ALL_CHANNELS, raw, t_ns, 0, np.zeros(COUNTS, np.int64))
+
+
+_NOTHING = np.frombuffer(b"", np.uint8)
+"""Read-only, as every piece of a file is: numba compiles for that."""

@@ -208,6 +208,12 @@ def parse(text: NDArray[np.uint8], start: int, channel: NDArray[np.uint8], raw: 
     return at, rows
 
 
+def warm_up() -> None:
+    """Compile or load the kernel that reads, before there is anything to measure."""
+    nothing = np.frombuffer(b"", np.uint8)  # read-only, as every piece of a file is: numba compiles for that
+    parse(nothing, 0, nothing, np.zeros((1, 72), np.uint8), np.zeros(1, np.int64), 0, np.zeros(2, np.int64))
+
+
 @kernel
 def _digits(value: int, base: int, width: int, out: NDArray[np.uint8], at: int) -> int:
     for k in range(width):

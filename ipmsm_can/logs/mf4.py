@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -53,10 +52,15 @@ def read_mf4(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
                        "install it (pip install 'ipmsm_can[mf4]')") from None
     channel = None if request.channel is None else request.channel_number()
     with unpacked_file(request) as path:
+        with path.open("rb") as stream:
+            begins = stream.read(8).strip()
+        if begins not in (b"MDF", b"UnFinMF"):
+            raise LogError(f"{request.path} cannot be read as .mf4: it does not begin with 'MDF'")
         try:
-            file = MDF(Path(path))
+            file = MDF(path)
         except Exception as error:  # asammdf raises what its parsers meet
-            raise LogError(f"{request.path} cannot be read as .mf4: {words_of(error)}") from error
+            _forget(error)
+            raise LogError(f"{request.path} is cut off or damaged: {words_of(error)}") from error
         with closing(file):
             groups = _bus_groups(file)
             if not groups:
@@ -73,6 +77,18 @@ def read_mf4(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
             except Exception as error:
                 outcome.problem = f"{request.path} is cut off or damaged: {words_of(error)}"
     outcome.done = 1.0
+
+
+def _forget(error: Exception) -> None:
+    """Tell a file that asammdf could not open that it is closed: else its destructor fails, and Python says so."""
+    from asammdf.blocks.mdf_v4 import MDF4
+
+    at = error.__traceback__
+    while at is not None:
+        half_open = at.tb_frame.f_locals.get("self")
+        if isinstance(half_open, MDF4):
+            half_open._closed = True
+        at = at.tb_next
 
 
 def _bus_groups(file: MDF) -> list[tuple[int, str]]:

@@ -37,13 +37,32 @@ def read_other(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
         return
     with Source(request.path, request.packed) as source:
         lines = _WholeLines(source)
-        yield from _blocks(lambda: reader(lines), request, outcome, source)
+        yield from _blocks(lambda: _asc_reader(lines) if request.kind == ".asc" else reader(lines), request,
+                           outcome, source)
         if lines.rest:
             outcome.problem = outcome.problem or (
                 f"{request.path} is cut off: its last line has no end and is left out")
         elif lines.open_block:
             outcome.problem = outcome.problem or f"{request.path} is cut off: it has no line 'End TriggerBlock'"
     outcome.done = 1.0
+
+
+def _asc_reader(lines: _WholeLines) -> Any:
+    """Time stamps since 1970 where the file tells its date in words that python-can knows, else from 0."""
+    import can
+
+    reader: Any = can.ASCReader(lines, relative_timestamp=False)
+    known = reader._datetime_to_timestamp
+
+    def start(words: str) -> float:
+        try:
+            since: float = known(words)
+            return since
+        except ValueError:
+            return 0.0
+
+    reader._datetime_to_timestamp = start
+    return reader
 
 
 def _blocks(opening: Any, request: Request, outcome: Outcome, source: Source | None) -> Iterator[FrameBlock]:

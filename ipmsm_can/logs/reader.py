@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs import blf_kernel, candump
 from ipmsm_can.logs.blf import read_blf
 from ipmsm_can.logs.candump import read_candump
 from ipmsm_can.logs.mf4 import read_mf4
@@ -15,6 +16,8 @@ from ipmsm_can.logs.source import LogError, Outcome, Request
 
 _OWN: dict[str, Callable[[Request, Outcome], Iterator[FrameBlock]]] = {
     ".blf": read_blf, ".log": read_candump, ".mf4": read_mf4}
+_WARM_UP = {".blf": blf_kernel.warm_up, ".log": candump.warm_up}
+"""Compile or load the kernel of a format: before anybody's clock runs."""
 
 
 class LogReader:
@@ -33,6 +36,8 @@ class LogReader:
         request = Request(self.path, kind, packed, block_frames, channel)
         if kind not in _OWN:
             check_kind(request, list(_OWN))
+        if kind in _WARM_UP:
+            _WARM_UP[kind]()
         self._outcome = Outcome()
         self._blocks = self._guarded(_OWN.get(kind, read_other)(request, self._outcome))
 

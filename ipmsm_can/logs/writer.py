@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import re
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,8 @@ from ipmsm_can.frames import FRAME_BYTES, FrameBlock
 from ipmsm_can.logs import candump
 from ipmsm_can.logs.blf import BlfWriter
 from ipmsm_can.logs.source import LogError, words_of
+
+_PATIENCE_S = 60.0
 
 
 class _Writer(Protocol):
@@ -51,8 +54,11 @@ class _PythonCanWriter:
 
         self._logger: Any = can.Logger(path)
         self._channel = channel
+        self._is_database = isinstance(self._logger, can.SqliteWriter)
+        self._sent = 0
 
     def write(self, block: FrameBlock) -> None:
+        self._sent += len(block)
         for message in messages_from_block(block, self._channel):
             self._logger.on_message_received(message)
 
@@ -61,6 +67,10 @@ class _PythonCanWriter:
 
     def close(self) -> None:
         if self._logger is not None:
+            # python-can's database is written by a thread, which at `stop` drops what is beyond its next 500.
+            until = time.monotonic() + _PATIENCE_S
+            while self._is_database and self._logger.num_frames < self._sent and time.monotonic() < until:
+                time.sleep(0.01)
             self._logger.stop()
             self._logger = None
 
