@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ipmsm_can.frames import FrameBlock
+from ipmsm_can.frames import DATA_OFFSET, FrameBlock
 from ipmsm_can.logs import LogWriter, read_log
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 from tools.bench.source import drive_frames
@@ -38,7 +38,7 @@ DRIVE = '[motor]\npreset = "m2"\n[wire]\nnode = 0\n'
 
 
 def traffic(seconds: int) -> Iterator[FrameBlock]:
-    """Blocks of a minute; the 32-bit sample counters of DriveTiming and DriveReference go on from one to the next."""
+    """Blocks of a minute; the sample counters of DriveTiming and DriveReference go on from one to the next."""
     protocol = Protocol()
     stretch = drive_frames(float(RATE), float(STRETCH_S), fd=False)
     label = protocol.base_ids
@@ -53,9 +53,7 @@ def traffic(seconds: int) -> Iterator[FrameBlock]:
             column = codec.index["sample_counter"]
             values = codec.decode_rows(block.words, rows[kind])
             values[column] += begin * RATE
-            payload = np.ascontiguousarray(codec.encode(values))
-            block.raw[rows[kind], 8:8 + codec.length] = payload.view(np.uint8).reshape(len(payload), -1)[
-                :, :codec.length]
+            block.raw[rows[kind], DATA_OFFSET:] = codec.encode(values)[:, DATA_OFFSET:]
         if begin + STRETCH_S > seconds:
             block = block.take(block.t_ns < START_NS + seconds * 10**9)
         yield block
