@@ -214,6 +214,22 @@ def test_objects_outside_of_containers(tmp_path: Path) -> None:
     assert block.can_id.tolist() == [0x10, 0x11]
 
 
+def test_containers_smaller_than_an_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each container comes to the kernel by itself: an object may come in many pieces, a piece may end anywhere."""
+    monkeypatch.setattr("ipmsm_can.logs.blf.CHUNK_BYTES", 1)
+    rng = np.random.default_rng(4)
+    block = random_block(300, 12)
+    write_log(tmp_path / "whole.blf", [block])
+    content = (tmp_path / "whole.blf").read_bytes()
+    stream = zlib.decompress(content[144 + 32:])
+    assert len(stream) < 1 << 17  # one container
+    for most in (2, 10, 60, 500):
+        sizes = rng.integers(1, most, len(stream)).tolist()
+        sizes = sizes[:int(np.searchsorted(np.cumsum(sizes), len(stream)))]
+        found = read_bytes(tmp_path / "a.blf", a_file(stream, sizes), block_frames=77)
+        assert np.array_equal(found.raw, block.raw), most
+
+
 # ---- damage -------------------------------------------------------------------------------------------
 
 def small_file() -> tuple[bytes, FrameBlock]:
