@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.config.build import estimator_settings, injection_settings, startup_settings
+from ipmsm_can.config.build import estimator_settings, injection_settings, probing_frequency, startup_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import clipping, confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
@@ -117,7 +117,7 @@ class Node:
         self._clipping = clipping.new_state()
         self.startup: StartUp | None = None
         """The start-up at standstill; None before the first sample, and where it may not ask for pulses."""
-        self.meter = meter.new_state(config.injection.frequency, 1.0)
+        self.meter = meter.new_state(0.0, 1.0)
         self._last_arrival: int | None = None
         self.samples_per_frame = 1
         self.next_status = _AT_ONCE
@@ -193,8 +193,9 @@ class Node:
         estimator = self.estimator
         if estimator is None or estimator.sample_rate != run.sample_rate:
             estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
-            frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
+            frequency = min(probing_frequency(self.config, run.sample_rate), 0.5 * run.sample_rate)
             self.meter = meter.new_state(frequency, run.sample_rate)
+            self.scheduler.settings = injection_settings(self.config, run.sample_rate)
             if self._startup_settings is not None:
                 self.startup = StartUp(self._motor, estimator, self._startup_settings)
         if self.startup is None:
@@ -325,10 +326,16 @@ class Node:
         view = self.view
         if view.flags & confidence.LOCKED:
             self._probing_axis = view.theta
+        refused = startup is not None and startup.phase is Phase.REFUSED
+        standing = abs(view.omega) * self._motor.psi_m
+        if (startup is not None and startup.phase is Phase.WATCH and view.flags & confidence.LOCKED
+                and view.flags & confidence.POLARITY_KNOWN and self.scheduler.amplitude > 0.0
+                and standing < 0.5 * startup.still_below):
+            startup.resume(view.theta, view.sigma)
+        found = refused or view.flags & confidence.POLARITY_KNOWN
         return self.scheduler.update(period, view.omega, view.excitation, self._probing_axis, view.hf_current,
-                                     self._fresh(now_ns), self.running,
-                                     self._pulses(),
-                                     startup is not None and startup.phase is Phase.REFUSED)
+                                     self._fresh(now_ns), self.running, self._pulses(), refused,
+                                     view.sigma if found else math.pi, view.flags & confidence.VALID != 0)
 
     def _pulses(self) -> Command | None:
         wanted = None if self.startup is None else self.startup.pulses

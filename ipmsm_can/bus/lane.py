@@ -201,13 +201,13 @@ class FastLane:
         result[loop.COUNTER] = node.position_counter
         result[loop.NEXT_STATUS] = node.next_status
         companion = self._companion
-        calm_speed, calm_excitation = node.scheduler.calm
+        calm_speed, calm_excitation, calm_sigma = node.scheduler.calm
         plan = loop.Plan(
             lap_ns=LAP_NS, end_ns=now_ns + node.quiet_ns(now_ns), max_gap=node.receiver.sequencer.max_gap,
             every=node.samples_per_answer, flux_every=node.samples_per_flux_answer,
             oldest=int(OLDEST_ANSWER * node.view.sample_rate), injecting=int(node.injecting),
             rejected=node.rejected_commands, step=node.position_step, calm_speed=calm_speed,
-            calm_excitation=calm_excitation, status_period=node.status_period,
+            calm_excitation=calm_excitation, calm_sigma=calm_sigma, status_period=node.status_period,
             status=node.status_values(now_ns, companion.bus_load, companion.turnaround),
             state_row=self._state_row, time_every=TURNAROUND_EVERY, clock_every=self._clock_every,
             oldest_s=OLDEST_ANSWER)
