@@ -162,6 +162,12 @@ class StartUp:
             begin = end
         return parts[0] if len(parts) == 1 else _joined(parts)
 
+    def doubt(self) -> None:
+        """The estimator's angle is in doubt, and so is what was found here."""
+        if self.phase is not Phase.REFUSED:
+            self._begin_window()
+            self._to(Phase.WATCH)
+
     def resume(self, theta: float, sigma: float) -> None:
         """The rotor has come to a standstill with the probing signal on: its axis corrects the observer again.
 

@@ -20,6 +20,7 @@ class NodeStatus:
     injection: state and reason in words.  injecting: what the drive says.
     clipped: samples cut off at the end of their range; distrusting: what they spoiled has not faded yet.
     ever_locked, ever_valid: the angle was, at some time since the beginning.
+    encoder: what the drive's encoder says of the estimate, in words; empty where there is none or all is well.
     sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
     """
 
@@ -56,6 +57,7 @@ class NodeStatus:
     distrusting: bool = False
     ever_locked: bool = True
     ever_valid: bool = True
+    encoder: str = ""
 
     @property
     def known(self) -> bool:
