@@ -1,8 +1,8 @@
 """What probing costs and brings, fixed against scheduled by sigma: `python -m tools.probing`.
 
 Through the simulated drive and the wire, 5 kHz, 0.5 V of dead time, 0.02 A of noise, saturating machine, observer
-riccati, from standstill at an unknown angle to a constant speed at a tenth of rated torque.  The figures are over the
-last second:
+riccati, from standstill at an unknown angle to a constant speed at a tenth of rated torque.  The figures are over
+the last second:
 
     valid, sigma, error   share of the time; median [deg electrical]; rms [deg electrical]
     V                     amplitude that was injected in the median [V peak]
@@ -118,7 +118,8 @@ def cost(motor: str, rpm: float, injection: dict[str, Any], seconds: float = 3.0
 def main() -> int:
     """Print the table."""
     good = True
-    print(f"{'':30s} {'valid':>6s} {'sigma':>6s} {'error':>6s} {'V':>6s} {'ripple rms':>17s} {'peak':>17s} {'loss':>8s}")
+    print(f"{'':30s} {'valid':>6s} {'sigma':>6s} {'error':>6s} {'V':>6s} {'ripple rms':>17s} {'peak':>17s} "
+          f"{'loss':>8s}")
     for motor, machine in (("m1", PRESETS["m1"]), ("m2", PRESETS["m2"])):
         ways: dict[str, dict[str, Any]] = {
             "fixed": {"amplitude": FULL[motor], "waveform": "rotating", "speed_on": 1e4, "speed_off": 2e4},

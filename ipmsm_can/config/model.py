@@ -342,9 +342,6 @@ class DriveConfig(BaseModel):
             raise KeyProblem("observer.gamma", f"a number for observer.kind {self.observer.kind}; only ges has a "
                                                "schedule")
         rate, frequency = self.wire.sample_rate, self.injection.frequency
-        if self.injection.sigma_target and self.observer.kind != "riccati":
-            raise KeyProblem("injection.sigma_target", f"0 for observer.kind {self.observer.kind}; only riccati "
-                                                       "knows what injection does for its sigma")
         if frequency == "auto":
             if self.observer.kind.startswith("injection_"):
                 raise KeyProblem("injection.frequency", f"a number of Hz for observer.kind {self.observer.kind}")
@@ -408,9 +405,11 @@ class DriveConfig(BaseModel):
     def sigma_target(self) -> float:
         """1-sigma [deg electrical] that injection is to keep the angle below; 0: none."""
         given = self.injection.sigma_target
+        if self.observer.kind != "riccati":  # only its sigma tells what injection does for the angle
+            return 0.0
         if given is not None:
             return given
-        return SIGMA_TARGET if self.observer.kind == "riccati" and not self.injection.by_speed else 0.0
+        return 0.0 if self.injection.by_speed else SIGMA_TARGET
 
     @property
     def polarity_current(self) -> float | None:

@@ -18,6 +18,8 @@ OFF_REPEATS = 3
 """How often "off" is said after injection ended, so that one lost frame does not matter."""
 SETTLING = 0.06
 """How long after polarity pulses the measured current is not that of the waveform [s]."""
+ASTRAY = math.radians(20.0)
+"""1-sigma [rad electrical] beyond which the d-axis is not known well enough to probe along it."""
 _RECOVERY = 0.1
 """Share of the way back to full amplitude per second once the current is below its limit again."""
 
@@ -75,6 +77,7 @@ class InjectionScheduler:
         self.amplitude = 0.0
         self._wanted = False
         self._share = 1.0
+        self._along = False
         self._rule = SigmaRule(settings.sigma_target, settings.emf_speed, settings.floor / settings.amplitude)
         self._off_left = 0
         self._settling = 0.0
@@ -141,7 +144,9 @@ class InjectionScheduler:
             self._settling -= elapsed
             current = 0.0  # what is measured now may still be the pulses'
         allowed = self._limit(current, elapsed)
-        needed = self._rule.share(sigma, elapsed, allowed < 1.0)
+        # Whoever asks for it gets what is configured, neither less nor another waveform.
+        asked = self._operator is True
+        needed = 1.0 if asked else self._rule.share(sigma, elapsed, allowed < 1.0)
         target = s.amplitude * min(allowed, needed) if self._wanted else 0.0
         step = s.ramp * elapsed
         before = self.amplitude
@@ -155,7 +160,9 @@ class InjectionScheduler:
         if self.amplitude > 0.0:
             self._off_left = OFF_REPEATS
             axis = theta if s.axis is None else s.axis
-            waveform = Waveform.PULSATING if s.along_d and valid else s.waveform
+            # With hysteresis: each change of waveform takes the amplitude down and up.
+            self._along = s.along_d and not asked and (valid or (self._along and sigma < ASTRAY))
+            waveform = Waveform.PULSATING if self._along else s.waveform
             return Command(waveform, self.amplitude, s.frequency, axis, s.time_to_live)
         if self._off_left > 0:
             self._off_left -= 1
