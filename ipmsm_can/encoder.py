@@ -28,7 +28,7 @@ from ipmsm_can._jit import kernel
 SETTLE = 0.05
 """Time over which the encoder's zero is found [s]."""
 LIMIT = math.radians(10.0)
-FACTOR = 4.0
+FACTOR = 3.0
 PERSIST = 0.004
 REACH = 0.005
 """[s]"""

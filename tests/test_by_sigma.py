@@ -21,6 +21,7 @@ from ipmsm_can.wire.protocol import Waveform
 from tools import probing
 
 PERIOD = 0.02
+STEP = 0.2  # longer than DWELL: what a single call says holds
 TARGET = math.radians(3.0)
 EMF = 10.0
 
@@ -62,18 +63,26 @@ def test_the_share_stays_between_floor_and_whole_and_is_whole_when_in_doubt() ->
 
 def test_it_ends_where_the_back_emf_suffices_and_begins_as_sigma_rises() -> None:
     r = rule()
-    assert r.is_wanted(False, 0.0, math.pi)
-    assert r.is_wanted(True, 0.9 * EMF, 0.5 * TARGET)
-    assert not r.is_wanted(True, 1.1 * EMF, 0.5 * TARGET)
-    assert not r.is_wanted(False, 0.0, 0.8 * TARGET)  # standing still, but still known: no need yet
-    assert r.is_wanted(False, 0.0, 0.95 * TARGET)
+    assert r.is_wanted(False, 0.0, math.pi, STEP)
+    assert r.is_wanted(True, 0.9 * EMF, 0.5 * TARGET, STEP)
+    assert not r.is_wanted(True, 1.1 * EMF, 0.5 * TARGET, STEP)
+    assert not r.is_wanted(False, 0.0, 0.8 * TARGET, STEP)  # standing still, but still known: no need yet
+    assert r.is_wanted(False, 0.0, 0.95 * TARGET, STEP)
+
+
+def test_a_moment_of_speed_does_not_end_it() -> None:
+    """What a correction of the angle at standstill looks like to the speed loop."""
+    r = rule()
+    for _ in range(20):
+        for speed in (0.0, 3.0 * EMF, 2.0 * EMF, 0.0):
+            assert r.is_wanted(True, speed, 0.5 * TARGET, PERIOD)
 
 
 def test_at_speed_it_is_never_wanted() -> None:
     r = rule()
-    assert not r.is_wanted(False, OUT_OF_REACH * EMF, math.pi)
-    assert not r.is_wanted(True, OUT_OF_REACH * EMF, math.pi)
-    assert r.is_wanted(True, 0.9 * OUT_OF_REACH * EMF, math.pi)
+    assert not r.is_wanted(False, OUT_OF_REACH * EMF, math.pi, STEP)
+    assert not r.is_wanted(True, OUT_OF_REACH * EMF, math.pi, STEP)
+    assert r.is_wanted(True, 0.9 * OUT_OF_REACH * EMF, math.pi, STEP)
 
 
 def test_it_does_not_go_on_and_off_for_ever_where_the_back_emf_does_not_suffice_after_all() -> None:
@@ -82,7 +91,7 @@ def test_it_does_not_go_on_and_off_for_ever_where_the_back_emf_does_not_suffice_
     wanted, changes = True, 0
     speeds = np.linspace(0.5 * EMF, 2.0 * EMF, 4000)
     for speed in speeds:
-        before, wanted = wanted, r.is_wanted(wanted, float(speed), (0.7 if wanted else 1.1) * TARGET)
+        before, wanted = wanted, r.is_wanted(wanted, float(speed), (0.7 if wanted else 1.1) * TARGET, STEP)
         changes += wanted != before
         r.share(0.7 * TARGET, PERIOD, False)
     assert 2 <= changes <= 2 * (1 + math.log(2.0) / math.log(AGAIN))
@@ -90,20 +99,20 @@ def test_it_does_not_go_on_and_off_for_ever_where_the_back_emf_does_not_suffice_
 
 def test_where_the_whole_amplitude_does_no_good_ending_is_tried_once() -> None:
     r = rule()
-    r.is_wanted(False, 0.7 * EMF, math.pi)
-    assert r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET)
+    r.is_wanted(False, 0.7 * EMF, math.pi, STEP)
+    assert r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET, STEP)
     go(r, 1.2 * TARGET, 1.5)
-    assert not r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET)
-    assert r.is_wanted(False, 0.7 * EMF, 1.2 * TARGET)  # it was no better without
+    assert not r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET, STEP)
+    assert r.is_wanted(False, 0.7 * EMF, 1.2 * TARGET, STEP)  # it was no better without
     go(r, 1.2 * TARGET, 5.0)
-    assert r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET)
+    assert r.is_wanted(True, 0.7 * EMF, 1.2 * TARGET, STEP)
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 200.0), st.floats(0.0, math.pi), st.booleans()), max_size=80))
 def test_whatever_comes_the_share_stays_in_bounds(inputs: list[tuple[float, float, bool]]) -> None:
     r, wanted = rule(), False
     for speed, sigma, limited in inputs:
-        wanted = r.is_wanted(wanted, speed, sigma)
+        wanted = r.is_wanted(wanted, speed, sigma, STEP)
         assert 0.2 <= r.share(sigma, PERIOD, limited) <= 1.0
 
 

@@ -27,6 +27,8 @@ FRUITLESS = 1.0
 """[s]"""
 OUT_OF_REACH = 4.0
 AGAIN = 1.25
+DWELL = 0.1
+"""How long the speed must be enough [s]: what corrects the angle at standstill shows as speed for a moment."""
 RISE_TIME = 0.5
 """From nothing to the whole amplitude [s]."""
 FALL_TIME = 4.0 * RISE_TIME
@@ -50,6 +52,7 @@ class SigmaRule:
         self._smooth = math.pi
         self._failed = 0.0
         self._fruitless = 0.0
+        self._enough = 0.0
 
     @property
     def decides(self) -> bool:
@@ -61,23 +64,25 @@ class SigmaRule:
         """Injection may begin below this speed [rad/s electrical], once sigma is above this [rad electrical]."""
         return OUT_OF_REACH * self.emf_speed, RAISE * self.target
 
-    def is_wanted(self, before: bool, speed: float, sigma: float) -> bool:
-        """Whether to inject; before: whether it was wanted; speed: |omega| [rad/s electrical]; sigma [rad]."""
+    def is_wanted(self, before: bool, speed: float, sigma: float, elapsed: float) -> bool:
+        """Whether to inject; before: whether it was wanted; speed: |omega| [rad/s electrical]; sigma [rad
+        electrical]; elapsed: since the last call [s]."""
         within, wake = self.calm
-        if speed >= within:
-            self._failed = 0.0
-            return False
         if not before:
-            if sigma <= wake:
+            if speed >= within or sigma <= wake:
                 return False
             # What is not known at all says nothing about the back-EMF.
             self._failed = max(self._failed, speed if sigma < math.pi else 0.0)
-            self.level, self._smooth, self._fruitless = 1.0, math.pi, 0.0
+            self.level, self._smooth, self._fruitless, self._enough = 1.0, math.pi, 0.0, 0.0
             return True
-        if speed <= AGAIN * self._failed or not sigma < DOUBTFUL * self.target:
+        needed = (_TRY_FROM if self._fruitless >= FRUITLESS else 1.0) * self.emf_speed
+        enough = speed > max(needed, AGAIN * self._failed) and sigma < DOUBTFUL * self.target
+        self._enough = self._enough + elapsed if enough or speed >= within else 0.0
+        if self._enough < DWELL:
             return True
-        return not (speed > self.emf_speed
-                    or (speed > _TRY_FROM * self.emf_speed and self._fruitless >= FRUITLESS))
+        if speed >= within:
+            self._failed = 0.0
+        return False
 
     def share(self, sigma: float, elapsed: float, limited: bool) -> float:
         """Share of the amplitude, 0..1.

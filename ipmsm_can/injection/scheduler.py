@@ -132,7 +132,7 @@ class InjectionScheduler:
         s = self.settings
         if self.state is InjectionState.DISABLED:
             return None
-        reason = self._decide(abs(omega), excitation, fresh, running, sigma)
+        reason = self._decide(abs(omega), excitation, fresh, running, sigma, elapsed)
         if pulses is not None and self._wanted:
             self._off_left = OFF_REPEATS
             self._settling = SETTLING
@@ -170,7 +170,7 @@ class InjectionScheduler:
         return None
 
     def _decide(self, speed: float, excitation: float, fresh: bool, running: bool,
-                sigma: float) -> InjectionReason:
+                sigma: float, elapsed: float) -> InjectionReason:
         s = self.settings
         by_excitation = s.excitation_off > 0.0
         if not fresh:
@@ -183,7 +183,7 @@ class InjectionScheduler:
             self._wanted = self._operator
             return InjectionReason.OPERATOR
         if self._rule.decides:
-            before, self._wanted = self._wanted, self._rule.is_wanted(self._wanted, speed, sigma)
+            before, self._wanted = self._wanted, self._rule.is_wanted(self._wanted, speed, sigma, elapsed)
             if self._wanted == before:
                 return self.reason
             return InjectionReason.LOW_SPEED if self._wanted else InjectionReason.SPEED_HIGH_ENOUGH
