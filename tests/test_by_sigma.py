@@ -194,12 +194,12 @@ def test_hand_over_from_standstill_to_speed_and_back(motor: str) -> None:
 
 
 def test_a_valid_angle_is_probed_along_d_and_that_makes_next_to_no_torque() -> None:
-    scheduled = probing.cost("m2", 0.0, {"amplitude": 4.2}, 2.0)
-    fixed = probing.cost("m2", 0.0, {"amplitude": 4.2, "waveform": "rotating", "speed_on": 1e4}, 2.0)
+    scheduled = probing.cost("m1", 0.0, {"amplitude": 9.0}, 2.0)
+    fixed = probing.cost("m1", 0.0, {"amplitude": 9.0, "waveform": "rotating", "speed_on": 1e4}, 2.0)
     assert scheduled.valid > 0.5 and fixed.valid > 0.5
     assert scheduled.ripple < 0.2 * fixed.ripple
     assert scheduled.loss < fixed.loss
-    assert fixed.ripple > 0.01 * PRESETS["m2"].rated_torque
+    assert fixed.ripple > 0.01 * PRESETS["m1"].rated_torque
 
 
 def test_the_amplitude_settles_where_sigma_meets_the_target() -> None:
