@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.config.build import estimator_settings, injection_settings, startup_settings
+from ipmsm_can.config.build import estimator_settings, injection_settings, probing_frequency, startup_settings
 from ipmsm_can.config.model import DriveConfig
+from ipmsm_can.encoder import Agreement, EncoderCheck
 from ipmsm_can.estimation import clipping, confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.estimation.observers.kinds import KINDS
@@ -48,11 +49,16 @@ PULSES_TIME_TO_LIVE = 0.03
 without orders for long."""
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
+ENCODER_LAP_NS = 10_000_000
+"""How often an encoder that may show the angle to be wrong must be looked at [ns]."""
+_CLEAR_EMF = 4.0
+"""Back-EMF, in units of the voltage uncertainty, above which the estimate rests on rotation."""
 STATUS_VERSION = 1
 INJECTING, NOT_RUNNING = 1, 2
 """Bits of what is remembered of a DriveStatus."""
 _STATUSES_KEPT = 4096
 
+_REFERENCE = MessageKind.DRIVE_REFERENCE
 _SAMPLE, _BLOCK, _TIMING, _STATUS = (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK,
                                      MessageKind.DRIVE_TIMING, MessageKind.DRIVE_STATUS)
 
@@ -115,9 +121,12 @@ class Node:
         self._startup_settings = startup_settings(config) if transmit else None
         self.estimator: Estimator | None = None
         self._clipping = clipping.new_state()
+        self.encoder = EncoderCheck()
+        self._latest: Tracked | None = None
+        self._may_doubt = transmit
         self.startup: StartUp | None = None
         """The start-up at standstill; None before the first sample, and where it may not ask for pulses."""
-        self.meter = meter.new_state(config.injection.frequency, 1.0)
+        self.meter = meter.new_state(0.0, 1.0)
         self._last_arrival: int | None = None
         self.samples_per_frame = 1
         self.next_status = _AT_ONCE
@@ -130,6 +139,8 @@ class Node:
         status = protocol.codecs[_STATUS].index
         self._waveform_row, self._rejected_row = status["active_waveform"], status["rejected_commands"]
         self._mode_row, self._version_row = status["mode"], status["protocol_version"]
+        reference = protocol.codecs[_REFERENCE].index
+        self._reference_rows = reference["theta_e"], reference["sample_counter"]
         position = protocol.codecs[MessageKind.POSITION_ESTIMATE]
         self._position_width = len(position.signals)
         self.position_rows = np.array([position.index[name] for name in POSITION_SIGNALS], np.intp)
@@ -154,10 +165,54 @@ class Node:
             self._hear(block.t_ns[status], values)
             self.rejected_commands = int(np.nan_to_num(values[self._rejected_row, -1]))
         tracked = [self._track(run) for run in runs]
+        self.hear_encoder(block, rows.get(_REFERENCE, none), tracked)
         if not self.receiver.sequencer.waiting and self._said_at.size > 1:
             # Only samples from the time of the last DriveStatus on can still come.
             self._forget(int(np.searchsorted(self._said_at, self._said_at[-1], side="left")))
         return tracked
+
+    def hear_encoder(self, block: FrameBlock, rows: NDArray[np.intp], tracked: Sequence[Tracked]) -> None:
+        """Compare DriveReference frames with the estimates of the same samples, which `tracked` holds.
+
+        Where they part at standstill, and the companion answers, the angle is not valid until it is found anew.
+        """
+        if tracked:
+            self._latest = tracked[-1]
+        if not rows.size or self._latest is None:
+            return
+        values, _, _ = self._protocol.decode(_REFERENCE, self.number, block.raw, rows)
+        theta, counter = values[self._reference_rows[0]], values[self._reference_rows[1]]
+        good = np.isfinite(theta) & np.isfinite(counter) & (np.abs(counter) < 2.0**32)
+        numbers = counter[good].astype(np.int64)
+        parts = tracked or [self._latest]
+        # Each reference goes with the last run of samples that had begun by then.
+        which = np.clip(np.searchsorted([p.run.counter[0] for p in parts], numbers, side="right") - 1, 0, None)
+        begins = False
+        for k, part in enumerate(parts):
+            e, own = part.estimate, which == k
+            valid = e.flags & confidence.VALID != 0
+            begins |= self.encoder.compare(part.run.counter, e.angle[speed.THETA_HAT], e.angle[speed.OMEGA],
+                                           e.sigma, valid, part.run.sample_rate, numbers[own], theta[good][own])
+        if not begins:
+            return
+        self.encoder.settle()
+        if self._may_doubt and self.estimator is not None and not self.turns:
+            self.estimator.doubt()
+            self.view.flags &= 0xFF ^ (confidence.VALID | confidence.POLARITY_KNOWN)
+            if self.startup is not None:
+                self.startup.doubt()
+
+    @property
+    def turns(self) -> bool:
+        """The angle rests on rotation: the back-EMF stands clear of what the voltage may be wrong by."""
+        emf = abs(self.view.omega) * self._motor.psi_m
+        return bool(self.view.flags & confidence.LOCKED) and emf > _CLEAR_EMF * self._settings.voltage_uncertainty
+
+    @property
+    def lap_ns(self) -> int:
+        """How long a runner may go on before the encoder has to be heard [ns]."""
+        listening = self.encoder.agreement is not Agreement.NONE and not self.turns
+        return ENCODER_LAP_NS if listening else _LONG_NS
 
     def _hear(self, t_ns: NDArray[np.int64], status: NDArray[np.float64]) -> None:
         """Keep what DriveStatus said, and when, for the samples that come after it."""
@@ -193,8 +248,9 @@ class Node:
         estimator = self.estimator
         if estimator is None or estimator.sample_rate != run.sample_rate:
             estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
-            frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
+            frequency = min(probing_frequency(self.config, run.sample_rate), 0.5 * run.sample_rate)
             self.meter = meter.new_state(frequency, run.sample_rate)
+            self.scheduler.settings = injection_settings(self.config, run.sample_rate)
             if self._startup_settings is not None:
                 self.startup = StartUp(self._motor, estimator, self._startup_settings)
         if self.startup is None:
@@ -325,10 +381,16 @@ class Node:
         view = self.view
         if view.flags & confidence.LOCKED:
             self._probing_axis = view.theta
+        refused = startup is not None and startup.phase is Phase.REFUSED
+        standing = abs(view.omega) * self._motor.psi_m
+        if (startup is not None and startup.phase is Phase.WATCH and view.flags & confidence.LOCKED
+                and view.flags & confidence.POLARITY_KNOWN and self.scheduler.amplitude > 0.0
+                and standing < 0.5 * startup.still_below):
+            startup.resume(view.theta, view.sigma)
+        found = refused or view.flags & confidence.POLARITY_KNOWN
         return self.scheduler.update(period, view.omega, view.excitation, self._probing_axis, view.hf_current,
-                                     self._fresh(now_ns), self.running,
-                                     self._pulses(),
-                                     startup is not None and startup.phase is Phase.REFUSED)
+                                     self._fresh(now_ns), self.running, self._pulses(), refused,
+                                     view.sigma if found else math.pi, view.flags & confidence.VALID != 0)
 
     def _pulses(self) -> Command | None:
         wanted = None if self.startup is None else self.startup.pulses

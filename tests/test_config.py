@@ -61,8 +61,9 @@ def test_defaults() -> None:
         "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 10.0,
     }
     assert config.injection.model_dump() == {
-        "enabled": True, "waveform": "rotating", "amplitude": 6.0, "frequency": 400.0, "speed_on": 40.0,
-        "speed_off": 60.0, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0, "current_limit": None,
+        "enabled": True, "waveform": "auto", "amplitude": 6.0, "frequency": 400.0, "sigma_target": None,
+        "speed_on": None, "speed_off": None, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0,
+        "current_limit": None,
         "time_to_live": 0.1, "period": 0.02, "axis": None, "polarity": True,
         "polarity_current": None, "polarity_amplitude": 30.0,
     }
@@ -170,15 +171,15 @@ WRONG = [
     (M2_ONLY + "[estimate]\nrate = '30 kHz'", 'estimate.rate is "30 kHz"; allowed is a number of Hz'),
     (M2_ONLY + "[injection]\nenabled = 1", "injection.enabled is 1; allowed is true or false"),
     (M2_ONLY + "[injection]\nwaveform = 'off'",
-     'injection.waveform is "off"; allowed is "rotating" or "pulsating"'),
+     'injection.waveform is "off"; allowed is "auto", "rotating" or "pulsating"'),
     (M2_ONLY + "[injection]\nspeed_on = '-6 rpm'",
      'injection.speed_on is "-6 rpm"; allowed is a number of rad/s elec'),
     (M2_ONLY + "[injection]\ntime_to_live = 1", "injection.time_to_live is 1; allowed is a number of s"),
     # keys that do not fit together; a default is named as such
-    (M2_ONLY + "[injection]\nspeed_off = 40",
+    (M2_ONLY + "[injection]\nspeed_on = 40\nspeed_off = 40",
      "injection.speed_off is 40; allowed is a speed above injection.speed_on, 40 rad/s electrical"),
-    (M2_ONLY + "[injection]\nspeed_on = '200 rpm'",
-     "injection.speed_off is 60 by default; allowed is a speed above injection.speed_on, 62.8319 rad/s "),
+    (M2_ONLY + "[injection]\nspeed_on = '200 rpm'\nspeed_off = 60",
+     "injection.speed_off is 60; allowed is a speed above injection.speed_on, 62.8319 rad/s "),
     (M2_ONLY + "[injection]\nexcitation_on = 2",
      "injection.excitation_off is 0 by default; allowed is a value above injection.excitation_on, 2 V^2 s"),
     (M2_ONLY + "[injection]\nperiod = '50 ms'",

@@ -24,7 +24,7 @@ from ipmsm_can.frames import FrameBlock
 from ipmsm_can.node import OLDEST_ANSWER, Tracked
 from ipmsm_can.wire.codec import MessageCodec
 from ipmsm_can.wire.kernels import FLOAT, KIND, PARENT
-from ipmsm_can.wire.protocol import MessageKind
+from ipmsm_can.wire.protocol import NODES, MessageKind
 from ipmsm_can.wire.receive import AXES, PLAUSIBLE
 from ipmsm_can.wire.sequence import SampleRun
 
@@ -201,13 +201,14 @@ class FastLane:
         result[loop.COUNTER] = node.position_counter
         result[loop.NEXT_STATUS] = node.next_status
         companion = self._companion
-        calm_speed, calm_excitation = node.scheduler.calm
+        calm_speed, calm_excitation, calm_sigma = node.scheduler.calm
         plan = loop.Plan(
-            lap_ns=LAP_NS, end_ns=now_ns + node.quiet_ns(now_ns), max_gap=node.receiver.sequencer.max_gap,
+            lap_ns=min(LAP_NS, node.lap_ns), end_ns=now_ns + node.quiet_ns(now_ns),
+            max_gap=node.receiver.sequencer.max_gap,
             every=node.samples_per_answer, flux_every=node.samples_per_flux_answer,
             oldest=int(OLDEST_ANSWER * node.view.sample_rate), injecting=int(node.injecting),
             rejected=node.rejected_commands, step=node.position_step, calm_speed=calm_speed,
-            calm_excitation=calm_excitation, status_period=node.status_period,
+            calm_excitation=calm_excitation, calm_sigma=calm_sigma, status_period=node.status_period,
             status=node.status_values(now_ns, companion.bus_load, companion.turnaround),
             state_row=self._state_row, time_every=TURNAROUND_EVERY, clock_every=self._clock_every,
             oldest_s=OLDEST_ANSWER)
@@ -226,7 +227,11 @@ class FastLane:
                    MessageKind.DRIVE_STATUS: statuses,
                    MessageKind.DRIVE_REFERENCE: taken - samples - timings - statuses}
         last_ns = kept.t_ns[taken - 1] if taken else now_ns
-        return Lap(frames, by_kind, self._tracked(done) if done else [],
+        tracked = self._tracked(done) if done else []
+        if by_kind[MessageKind.DRIVE_REFERENCE]:
+            label = MessageKind.DRIVE_REFERENCE * NODES + node.number
+            node.hear_encoder(frames, np.flatnonzero(companion.protocol.classify(frames.raw) == label), tracked)
+        return Lap(frames, by_kind, tracked,
                    FrameBlock(incoming.raw[:left].copy(), incoming.t_ns[:left].copy()) if why == loop.STRANGE
                    else _NOTHING,
                    FrameBlock(kept.sent_words[:sent].copy().view(np.uint8), kept.sent_t_ns[:sent].copy()),

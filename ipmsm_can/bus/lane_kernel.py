@@ -140,7 +140,8 @@ class Plan(NamedTuple):
     max_gap: longest loss, in samples, that is filled.
     every, flux_every: samples per PositionEstimate and ActiveFluxEstimate; oldest: age in samples beyond which
     none is sent.  injecting, rejected: what DriveStatus said last.  step: resolution of theta_e [rad].
-    calm_speed [rad/s electrical], calm_excitation [V^2 s]: below them Python is to be asked at once.
+    calm_speed [rad/s electrical], calm_excitation [V^2 s]: below them Python is to be asked at once; by the
+    speed only where sigma is above calm_sigma [rad electrical].
     status_period [ns]; status (n_signals, 1): CompanionStatus as of the lap's beginning, but for its state, which
     goes into row state_row.
     time_every: of so many answers, one is timed; clock_every: for so many, the clock is read once to see whether
@@ -158,6 +159,7 @@ class Plan(NamedTuple):
     step: float
     calm_speed: float
     calm_excitation: float
+    calm_sigma: float
     status_period: int
     status: Floats
     state_row: int
@@ -424,5 +426,6 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
             if n_due > 0 and answer % plan.time_every == 0 and result[TIMED] < kept.took.shape[0]:
                 kept.took[result[TIMED]] = 1e-9 * (_clock(outgoing) - run_t[due[n_due - 1]])
                 result[TIMED] += 1
-        if over or abs(angle[speed.OMEGA, m - 1]) < plan.calm_speed or excited[m - 1] < plan.calm_excitation:
+        slow = abs(angle[speed.OMEGA, m - 1]) < plan.calm_speed and sigma[m - 1] > plan.calm_sigma
+        if over or slow or excited[m - 1] < plan.calm_excitation:
             return DONE

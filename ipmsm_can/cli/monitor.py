@@ -16,6 +16,7 @@ import numpy as np
 
 from ipmsm_can.bus.errors import ErrorCounters
 from ipmsm_can.cli.status import BusStatus, DriveNodeStatus, DriveStatus, NodeStatus, RunStatus
+from ipmsm_can.encoder import NOTABLE, EncoderCheck
 from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.wire.protocol import CompanionState, InjectionReason, InjectionState
@@ -135,7 +136,18 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever:
         restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands,
         clipped=count("clipped"), distrusting=node.distrusting,
         timing=delay.words if delay is not None and delay.applied else "",
-        ever_locked=bool(ever & confidence.LOCKED), ever_valid=bool(ever & confidence.VALID))
+        ever_locked=bool(ever & confidence.LOCKED), ever_valid=bool(ever & confidence.VALID),
+        encoder=encoder_words(node.encoder))
+
+
+def encoder_words(check: EncoderCheck) -> str:
+    """What is notable of the encoder beside the estimate; empty where nothing is."""
+    said = []
+    if check.disagreements:
+        said.append(f"parted from the estimate {check.disagreements} times, slipped {check.slips} times")
+    if abs(check.offset) > NOTABLE:
+        said.append(f"its zero is off by {math.degrees(check.offset):+.1f} deg electrical")
+    return "; ".join(said)
 
 
 def injection_words(state: InjectionState, reason: InjectionReason, amplitude: float) -> str:

@@ -65,6 +65,8 @@ def line(status: Status) -> str:
         if n.live:
             text += (f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm, probing {n.injection}, "
                      f"lost {n.lost} bad {n.bad_frames}" + (f", {n.timing}" if n.timing else ""))
+            if n.encoder:
+                text += f", encoder {n.encoder}"
     return text
 
 
@@ -93,6 +95,8 @@ def summary(status: Status) -> str:
         lines.append(f"  last: {n.state}{known}")
         if n.timing:
             lines.append(f"  {n.timing}")
+        if n.encoder:
+            lines.append(f"  encoder: {n.encoder}")
         if not n.ever_locked:
             lines.append("  the observer never locked: no angle of this drive could be used")
         elif not n.ever_valid:

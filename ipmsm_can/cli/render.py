@@ -29,7 +29,7 @@ def _run(status: RunStatus, width: int, height: int) -> list[Text]:
     lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
     tail = _bus(status, width)
     room = height - len(lines) - len(tail)
-    if _BLOCK_LINES * len(status.nodes) <= room:
+    if _BLOCK_LINES * len(status.nodes) + sum(bool(n.encoder) for n in status.nodes) <= room:
         for node in status.nodes:
             lines += [*_node(node, width), Text()]
     else:
@@ -93,12 +93,14 @@ def _node(node: NodeStatus, width: int) -> list[Text]:
     if node.rejected_commands:
         probing.append(f"  {node.rejected_commands} commands refused", style="red")
     losses = plain.losses(node)
+    encoder = [_labelled("encoder", (node.encoder, "yellow"))] if node.encoder else []
     lines = [
         head,
         _labelled("angle", f"{plain.angle(node) + ' electrical' if node.known else 'unknown':35}",
                   (node.trust, _trust_style(node))),
         _labelled("speed", speed),
         _labelled("probing", probing),
+        *encoder,
         _labelled("samples", f"{node.samples_per_s:.0f}/s of {node.sample_rate:.0f} Hz   estimates "
                   f"{node.estimates_per_s:.0f}/s   excitation {node.excitation:.3g} V^2 s"),
         _labelled("", _counts(losses[:4])),

@@ -21,6 +21,7 @@ class NodeStatus:
     clipped: samples cut off at the end of their range; distrusting: what they spoiled has not faded yet.
     timing: how the voltage's timing is set right, "" where it is taken as it comes.
     ever_locked, ever_valid: the angle was, at some time since the beginning.
+    encoder: what the drive's encoder says of the estimate, in words; empty where there is none or all is well.
     sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
     """
 
@@ -58,6 +59,7 @@ class NodeStatus:
     timing: str = ""
     ever_locked: bool = True
     ever_valid: bool = True
+    encoder: str = ""
 
     @property
     def known(self) -> bool:

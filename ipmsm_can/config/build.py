@@ -26,24 +26,51 @@ def build_protocol(configs: Sequence[DriveConfig]) -> Protocol:
     return Protocol(Database.load(files[0]) if files and files[0] else None)
 
 
+SAMPLES_PER_PERIOD = 6
+"""Of a probing signal with `frequency = "auto"`: an even number, so that dead time is odd in the samples, too."""
+USUAL_FREQUENCY = 400.0
+"""Frequency [Hz] that the polarity pulses start from where that of the probing signal is chosen by itself."""
+_HIGHEST = 4000.0
+_EMF_SHARE = 0.19
+"""Voltage error, as a share of `voltage_uncertainty`, that turns an angle found by rotation; on M1 and M2."""
+_FLOOR = 4.0
+"""Least amplitude in units of `voltage_uncertainty`: with less, dead time answers as much as the rotor does."""
+
+
+def probing_frequency(config: DriveConfig, sample_rate: float) -> float:
+    """Frequency of the probing signal [Hz] at this sample rate [Hz]: the given one, or for auto a sixth of it."""
+    given = config.injection.frequency
+    if isinstance(given, float):
+        return given
+    return min(float(round(sample_rate / SAMPLES_PER_PERIOD)), _HIGHEST)
+
+
 def estimator_settings(config: DriveConfig) -> EstimatorSettings:
     """Settings of the estimator, derived defaults (gamma, epsilon) worked out."""
-    o = config.observer
+    o, given = config.observer, config.injection.frequency
     return EstimatorSettings(o.kind, config.alpha, config.gamma, o.initial_flux, config.epsilon,
                              o.excitation_window, o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
-                             config.estimate.valid_sigma, config.injection.frequency,
+                             config.estimate.valid_sigma, given if isinstance(given, float) else USUAL_FREQUENCY,
                              o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
                              o.adapt_resistance, o.gamma == "scheduled",
                              o.voltage_delay if isinstance(o.voltage_delay, float) else None)
 
 
-def injection_settings(config: DriveConfig) -> InjectionSettings:
-    """Settings of the injection scheduler, the current limit worked out."""
-    i = config.injection
-    return InjectionSettings(i.enabled, Waveform[i.waveform.upper()], i.amplitude, i.frequency, i.speed_on,
-                             i.speed_off, i.excitation_on, i.excitation_off, i.ramp, config.current_limit,
-                             i.time_to_live, i.period,
-                             None if i.axis is None else math.radians(i.axis))
+def injection_settings(config: DriveConfig, sample_rate: float = 0.0) -> InjectionSettings:
+    """Settings of the injection scheduler, the current limit worked out; sample_rate [Hz], 0 while not known."""
+    i, o = config.injection, config.observer
+    on, off = i.speeds
+    target = math.radians(config.sigma_target)
+    waveform = Waveform.ROTATING if i.waveform == "auto" else Waveform[i.waveform.upper()]
+    emf_speed = _EMF_SHARE * o.voltage_uncertainty / (config.build_motor().psi_m * target) if target else 0.0
+    return InjectionSettings(
+        enabled=i.enabled, waveform=waveform, amplitude=i.amplitude,
+        frequency=probing_frequency(config, sample_rate), speed_on=on, speed_off=off,
+        excitation_on=i.excitation_on, excitation_off=i.excitation_off, ramp=i.ramp,
+        current_limit=config.current_limit, time_to_live=i.time_to_live, period=i.period,
+        axis=None if i.axis is None else math.radians(i.axis), sigma_target=target,
+        emf_speed=0.0 if i.by_speed else emf_speed, floor=min(_FLOOR * o.voltage_uncertainty, i.amplitude),
+        along_d=i.waveform == "auto" and o.kind == "riccati" and i.axis is None)
 
 
 def startup_settings(config: DriveConfig) -> StartUpSettings | None:
@@ -51,7 +78,9 @@ def startup_settings(config: DriveConfig) -> StartUpSettings | None:
     current = config.polarity_current
     if current is None:
         return None
-    return StartUpSettings(config.injection.frequency, current, config.injection.polarity_amplitude)
+    frequency = config.injection.frequency
+    return StartUpSettings(frequency if isinstance(frequency, float) else USUAL_FREQUENCY, current,
+                           config.injection.polarity_amplitude)
 
 
 def drive_parameters(config: DriveConfig, fd: bool = False) -> DriveParameters:

@@ -25,7 +25,7 @@ ObserverKind = Literal["ges", "riccati", "spmsm_gradient", "spmsm_gradient_max",
 OBSERVER_KINDS: tuple[str, ...] = get_args(ObserverKind)
 """The observers a configuration may ask for; the one list of them."""
 
-Waveform = Literal["rotating", "pulsating"]
+Waveform = Literal["auto", "rotating", "pulsating"]
 
 ROTATING_CONVERGENCE = 70.0
 """Convergence rate gamma |Phi|^2 [1/s] of a fast-turning rotor that the default gamma gives."""
@@ -36,6 +36,12 @@ time, as the filter has a covariance to hold what a narrow one would have to hol
 
 CURRENT_LIMIT_SHARE = 0.15
 """Default limit of the high-frequency current as a share of the rated current."""
+
+SPEED_ON, SPEED_OFF = 40.0, 60.0
+"""Speeds [rad/s electrical] between which injection starts and stops, where speed decides and none is given."""
+
+SIGMA_TARGET = 3.0
+"""Default 1-sigma [deg electrical] that injection is to keep riccati below."""
 
 _FROM_PRESET = "from the preset"
 _MOTOR_NEEDS = ("pole_pairs", "psi_m", "L_d", "L_q", "R")
@@ -210,19 +216,32 @@ class InjectionConfig(Section):
 
     enabled: Annotated[bool, Switch(doc="Whether injection commands may be sent at all.")] = True
     waveform: Annotated[Waveform, Choice(
-        doc="rotating in the stationary frame, or pulsating along the estimated d-axis.",
-        choices=get_args(Waveform))] = "rotating"
+        doc="rotating in the stationary frame, pulsating along the estimated d-axis, where it makes least torque, "
+            "or auto: rotating, and pulsating while the angle of riccati is valid.",
+        choices=get_args(Waveform))] = "auto"
     amplitude: Annotated[float, Quantity(
-        doc="Amplitude of the injected voltage.", unit=units.VOLT_PEAK, above=0, most=1000)] = 6.0
-    frequency: Annotated[float, Quantity(
-        doc="Frequency of the injected voltage; less than half of wire.sample_rate.",
-        unit=units.HERTZ, least=1, most=20e3)] = 400.0
-    speed_on: Annotated[float, Quantity(
+        doc="Largest amplitude of the injected voltage; sigma_target may ask for less.",
+        unit=units.VOLT_PEAK, above=0, most=1000)] = 6.0
+    frequency: Annotated[float | Literal["auto"], QuantityOrWord(
+        doc="Frequency of the injected voltage; less than half of wire.sample_rate. auto: a sixth of the sample "
+            "rate, which needs more voltage for less torque ripple and loss.",
+        word="auto", unit=units.HERTZ, least=1, most=20e3)] = 400.0
+    sigma_target: Annotated[float | None, Quantity(
+        doc="1-sigma that injection is to keep the angle of riccati below, with the least amplitude (electrical); "
+            "0: always the full amplitude. Where it cannot be kept the amplitude is the full one.",
+        unit=units.DEGREE, least=0, most=45,
+        default=f"{SIGMA_TARGET:g} deg for riccati; 0 for the other kinds, and where speed_on, speed_off or "
+                "excitation_on is given", example="3 deg")] = None
+    speed_on: Annotated[float | None, Quantity(
         doc="Injection starts below this speed. Hz is the electrical frequency, rpm the shaft's speed.",
-        unit=units.SPEED, least=0)] = 40.0
-    speed_off: Annotated[float, Quantity(
+        unit=units.SPEED, least=0,
+        default=f"what sigma_target needs; {SPEED_ON:g} rad/s or two thirds of speed_off without one",
+        example=SPEED_ON)] = None
+    speed_off: Annotated[float | None, Quantity(
         doc="Injection stops above this speed; above speed_on. Hz and rpm as there.",
-        unit=units.SPEED, above=0)] = 60.0
+        unit=units.SPEED, above=0,
+        default=f"what sigma_target needs; {SPEED_OFF:g} rad/s or one and a half of speed_on without one",
+        example=SPEED_OFF)] = None
     excitation_on: Annotated[float, Quantity(
         doc="Injection also starts when excitation falls below this, whatever the speed; 0 = judge by speed "
             "only. A turning rotor gives 2 (alpha psi_m)^2 excitation_window at high speed.",
@@ -260,7 +279,7 @@ class InjectionConfig(Section):
 
     @model_validator(mode="after")
     def _consistent(self) -> InjectionConfig:
-        if self.speed_off <= self.speed_on:
+        if self.speed_on is not None and self.speed_off is not None and self.speed_off <= self.speed_on:
             raise KeyProblem(
                 "speed_off", f"a speed above injection.speed_on, {self.speed_on:g} rad/s electrical")
         if self.excitation_off <= self.excitation_on and (self.excitation_on, self.excitation_off) != (0, 0):
@@ -271,6 +290,19 @@ class InjectionConfig(Section):
             raise KeyProblem(
                 "period", f"a time below half of injection.time_to_live, {self.time_to_live:g} s")
         return self
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        """Speeds [rad/s electrical] below which injection starts and above which it stops, where speed decides."""
+        on, off = self.speed_on, self.speed_off
+        if on is None:
+            on = SPEED_ON if off is None else min(SPEED_ON, off / 1.5)
+        return on, max(SPEED_OFF, 1.5 * on) if off is None else off
+
+    @property
+    def by_speed(self) -> bool:
+        """Whether a key says by speed or excitation when to inject."""
+        return self.speed_on is not None or self.speed_off is not None or self.excitation_on > 0.0
 
 
 class DriveConfig(BaseModel):
@@ -323,17 +355,24 @@ class DriveConfig(BaseModel):
         if self.observer.gamma == "scheduled" and self.observer.kind != "ges":
             raise KeyProblem("observer.gamma", f"a number for observer.kind {self.observer.kind}; only ges has a "
                                                "schedule")
-        rate = self.wire.sample_rate
+        rate, frequency = self.wire.sample_rate, self.injection.frequency
+        if frequency == "auto":
+            if self.observer.kind.startswith("injection_"):
+                raise KeyProblem("injection.frequency", f"a number of Hz for observer.kind {self.observer.kind}")
+            return self._limited()
         if rate is not None and self.observer.kind.startswith("injection_"):
             # A window of whole periods, of samples that are faster than two a period.
             low = rate / WINDOW_CAPACITY if self.observer.kind == "injection_extraction" else 0.0
-            if not low <= self.injection.frequency < rate / 2:
+            if not low <= frequency < rate / 2:
                 raise KeyProblem(
                     "injection.frequency", f"a frequency from {low:g} Hz to below half of the sample rate of "
                     f"{rate:g} Hz, for observer.kind {self.observer.kind}")
-        if rate is not None and self.injection.enabled and self.injection.frequency >= rate / 2:
+        if rate is not None and self.injection.enabled and frequency >= rate / 2:
             raise KeyProblem(
                 "injection.frequency", f"a frequency below half of wire.sample_rate, {rate:g} Hz")
+        return self._limited()
+
+    def _limited(self) -> DriveConfig:
         if (self.injection.enabled and self.injection.current_limit is None
                 and self.motor.preset is None and self.motor.rated_torque is None):
             # Motor's own default torque belongs to the paper's machines: no basis for a limit elsewhere.
@@ -375,6 +414,16 @@ class DriveConfig(BaseModel):
         """Active flux [Wb] below which sigma(x) is 0: the given one, or psi_m / 10."""
         given = self.observer.epsilon
         return given if given is not None else self.motor.build().psi_m / 10.0
+
+    @property
+    def sigma_target(self) -> float:
+        """1-sigma [deg electrical] that injection is to keep the angle below; 0: none."""
+        given = self.injection.sigma_target
+        if self.observer.kind != "riccati":  # only its sigma tells what injection does for the angle
+            return 0.0
+        if given is not None:
+            return given
+        return 0.0 if self.injection.by_speed else SIGMA_TARGET
 
     @property
     def polarity_current(self) -> float | None:

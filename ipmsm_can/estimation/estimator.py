@@ -221,6 +221,12 @@ class Estimator:
             pll["omega"] = pll["omega_difference"] = o["pll_omega"] = o["pll_difference"] = 0.0
         common.stand_still(self._observer, i, complex(r["fi_a"], r["fi_b"]), x, self.settings.epsilon)
 
+    def doubt(self) -> None:
+        """Give up all trust in the angle, but not the angle: it has to be found anew from the samples to come."""
+        confidence.forget(self._confidence)
+        if KINDS[self.settings.kind] == RICCATI:
+            riccati.doubt(self._observer_parameters, self._observer)
+
     def _segment(self, samples: Floats, out: EstimateBlock) -> None:
         estimate_block(samples, self._regression_parameters, self._regression, self._observer_parameters,
                        self._observer, self._speed, self._excitation, self._confidence, out.regression,

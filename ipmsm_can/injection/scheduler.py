@@ -1,9 +1,9 @@
 """When to probe, how strong, and why: the state machine behind every InjectionCommand.
 
-Injection starts at low speed or on poor excitation and ends at speed, with hysteresis; the amplitude ramps up
-and down and is cut back in proportion where the measured high-frequency current exceeds its limit.  The
-scheduler has no clock: it is asked once per command period, with the time of the samples; while it `rests` it need
-not be asked.
+Injection starts at low speed or on poor excitation and ends at speed, with hysteresis; or the estimate's own sigma
+says when, and how much (`by_sigma`).  The amplitude ramps up and down and is cut back in proportion where the
+measured high-frequency current exceeds its limit.  The scheduler has no clock: it is asked once per command period,
+with the time of the samples; while it `rests` it need not be asked.
 """
 
 from __future__ import annotations
@@ -11,12 +11,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ipmsm_can.injection.by_sigma import SigmaRule
 from ipmsm_can.wire.protocol import InjectionReason, InjectionState, Waveform
 
 OFF_REPEATS = 3
 """How often "off" is said after injection ended, so that one lost frame does not matter."""
 SETTLING = 0.06
 """How long after polarity pulses the measured current is not that of the waveform [s]."""
+ASTRAY = math.radians(20.0)
+"""1-sigma [rad electrical] beyond which the d-axis is not known well enough to probe along it."""
+_ROOM = 0.6
 _RECOVERY = 0.1
 """Share of the way back to full amplitude per second once the current is below its limit again."""
 
@@ -28,6 +32,9 @@ class InjectionSettings:
     waveform; amplitude [V peak]; frequency [Hz]; speed_on, speed_off [rad/s electrical]; excitation_on,
     excitation_off [V^2 s], both 0 = not used; ramp [V/s]; current_limit [A peak]; time_to_live, period [s];
     axis: fixed angle [rad electrical] in the stationary frame, None: along the estimated d-axis.
+    sigma_target: 1-sigma [rad electrical] that the amplitude is to keep the angle below, 0 = always the whole
+    amplitude; emf_speed [rad/s electrical]: where the back-EMF alone should do that, 0 = the speeds above say when
+    to inject; floor: least amplitude [V peak].  along_d: pulsating along the d-axis while the angle is valid.
     """
 
     enabled: bool
@@ -43,6 +50,10 @@ class InjectionSettings:
     time_to_live: float
     period: float
     axis: float | None = None
+    sigma_target: float = 0.0
+    emf_speed: float = 0.0
+    floor: float = 0.0
+    along_d: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +78,8 @@ class InjectionScheduler:
         self.amplitude = 0.0
         self._wanted = False
         self._share = 1.0
+        self._along, self._along_below = False, math.pi
+        self._rule = SigmaRule(settings.sigma_target, settings.emf_speed, settings.floor / settings.amplitude)
         self._off_left = 0
         self._settling = 0.0
         self._operator: bool | None = None
@@ -94,28 +107,33 @@ class InjectionScheduler:
                 and self._operator is not True)
 
     @property
-    def calm(self) -> tuple[float, float]:
-        """Speed [rad/s electrical] and excitation [V^2 s] below which a resting scheduler must be asked again."""
+    def calm(self) -> tuple[float, float, float]:
+        """Speed [rad/s electrical] below which a resting scheduler must be asked again if sigma is above the third
+        [rad electrical], and excitation [V^2 s] below which it must be in any case."""
         s = self.settings
         if self.state is InjectionState.DISABLED or self._operator is not None:
-            return 0.0, 0.0
-        return s.speed_on, s.excitation_on
+            return 0.0, 0.0, 0.0
+        if self._rule.decides:
+            speed, sigma = self._rule.calm
+            return speed, 0.0, sigma
+        return s.speed_on, s.excitation_on, -1.0
 
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
                fresh: bool, running: bool = True, pulses: Command | None = None,
-               unknowable: bool = False) -> Command | None:
+               unknowable: bool = False, sigma: float = math.pi, valid: bool = False) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.
 
         elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
         electrical] of the estimate.  current: measured high-frequency current [A peak].  fresh: samples
         are coming in.  running: the inverter applies the voltage it reports, as far as is known.
         pulses: polarity pulses, asked for instead of the waveform where that may be injected.  unknowable: the
-        polarity was asked for in vain.
+        polarity was asked for in vain.  sigma: 1-sigma of the angle [rad electrical], pi = unknown, or still to be
+        found by the start-up.  valid: the angle is.
         """
         s = self.settings
         if self.state is InjectionState.DISABLED:
             return None
-        reason = self._decide(abs(omega), excitation, fresh, running)
+        reason = self._decide(abs(omega), excitation, fresh, running, sigma, elapsed)
         if pulses is not None and self._wanted:
             self._off_left = OFF_REPEATS
             self._settling = SETTLING
@@ -126,7 +144,11 @@ class InjectionScheduler:
         if self._settling > 0.0:
             self._settling -= elapsed
             current = 0.0  # what is measured now may still be the pulses'
-        target = s.amplitude * self._limit(current, elapsed) if self._wanted else 0.0
+        allowed = self._limit(current, elapsed)
+        # Whoever asks for it gets what is configured, neither less nor another waveform.
+        asked = self._operator is True
+        needed = 1.0 if asked else self._rule.share(sigma, elapsed, allowed < 1.0)
+        target = s.amplitude * min(allowed, needed) if self._wanted else 0.0
         step = s.ramp * elapsed
         before = self.amplitude
         if not (fresh and running):
@@ -139,13 +161,19 @@ class InjectionScheduler:
         if self.amplitude > 0.0:
             self._off_left = OFF_REPEATS
             axis = theta if s.axis is None else s.axis
-            return Command(s.waveform, self.amplitude, s.frequency, axis, s.time_to_live)
+            if self._along and not valid:
+                # Rotating shows the axis somewhat better; back only where there is room, or it would go to and fro.
+                self._along, self._along_below = False, _ROOM * min(sigma, ASTRAY)
+            self._along = s.along_d and not asked and valid and (self._along or sigma < self._along_below)
+            waveform = Waveform.PULSATING if self._along else s.waveform
+            return Command(waveform, self.amplitude, s.frequency, axis, s.time_to_live)
         if self._off_left > 0:
             self._off_left -= 1
             return Command(Waveform.OFF, 0.0, s.frequency, 0.0, s.time_to_live)
         return None
 
-    def _decide(self, speed: float, excitation: float, fresh: bool, running: bool) -> InjectionReason:
+    def _decide(self, speed: float, excitation: float, fresh: bool, running: bool,
+                sigma: float, elapsed: float) -> InjectionReason:
         s = self.settings
         by_excitation = s.excitation_off > 0.0
         if not fresh:
@@ -157,6 +185,11 @@ class InjectionScheduler:
         if self._operator is not None:
             self._wanted = self._operator
             return InjectionReason.OPERATOR
+        if self._rule.decides:
+            before, self._wanted = self._wanted, self._rule.is_wanted(self._wanted, speed, sigma, elapsed)
+            if self._wanted == before:
+                return self.reason
+            return InjectionReason.LOW_SPEED if self._wanted else InjectionReason.SPEED_HIGH_ENOUGH
         if not self._wanted:
             if speed < s.speed_on:
                 self._wanted = True

@@ -123,6 +123,14 @@ def _forget(P: Floats, st: Any, p: Any, ceiling: float) -> None:
 
 
 @kernel
+def doubt(parameters: NDArray[np.void], state: NDArray[np.void]) -> None:
+    """Nothing is known any more but the flux itself, as after a loss of lock; arguments as for `riccati_block`."""
+    p = parameters[0]
+    st = state[0]
+    _forget(st.P, st, p, 4.0 * p.psi_m * p.psi_m)
+
+
+@kernel
 def _filter_units(B: Floats, phi_a: float, phi_b: float, st: Any, p: Any) -> None:
     """F[B_j] and F[Phi^T F[B_j]] after one interval."""
     for j in range(BIASES):
