@@ -146,7 +146,7 @@ def test_the_operator_gets_the_whole_amplitude_and_the_waveform_configured() -> 
         command = s.update(PERIOD, 100.0, 1.0, 0.0, 0.1, True, sigma=0.01, valid=True)
     assert command is not None and (command.amplitude, command.waveform) == (6.0, Waveform.ROTATING)
     s.operator(None)
-    assert not s.update(PERIOD, 100.0, 1.0, 0.0, 0.1, True, sigma=0.01, valid=True) == command
+    assert s.update(PERIOD, 100.0, 1.0, 0.0, 0.1, True, sigma=0.01, valid=True) != command
 
 
 def test_what_does_not_fit_is_said_in_a_sentence() -> None:
