@@ -114,7 +114,6 @@ class StartUp:
         self._pause = 0
         self._tries = 0
         self._lost = 0
-        self._last_flags = 0
         self._last_peak = self._raised = 0.0
         self._begin_axis()
 
@@ -126,8 +125,9 @@ class StartUp:
     @property
     def busy(self) -> bool:
         """Whether it needs every sample as it comes."""
+        # Asked of the estimator, which may have gone on without the start-up since the last window.
         return self.possible and self.phase is not Phase.REFUSED and not (
-            self.phase is Phase.WATCH and self._last_flags & confidence.POLARITY_KNOWN)
+            self.phase is Phase.WATCH and self.estimator.polarity_known)
 
     @property
     def pulses(self) -> Pulses | None:
@@ -180,7 +180,6 @@ class StartUp:
     # At the end of each window, and where as many samples went by without one
 
     def _judge(self, flags: int, known_to: float) -> None:
-        self._last_flags = flags
         known = flags & confidence.POLARITY_KNOWN != 0
         if self.phase is Phase.WATCH:
             self._pause = max(0, self._pause - 1)

@@ -176,7 +176,8 @@ class DriveNode:
             "mode": mode[due],
             "active_waveform": s.injection_waveform[due],
             "encoder_available": (s.sample[due] < self._encoder_fails) & (self.settings.reference_rate > 0.0),
-            "faults": faults[due] + (COMMAND_REJECTED if refused else 0), "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
+            "faults": faults[due] + (COMMAND_REJECTED if refused else 0),
+            "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
             "temperature": np.full(due.size, TEMPERATURE),
             "protocol_version": np.full(due.size, PROTOCOL_VERSION),
             "rejected_commands": np.full(due.size, self.rejected & 0xFF)})

@@ -148,10 +148,13 @@ def _probe(out: Array, inj: Array, d: Array) -> None:
 
 @kernel
 def _simulate(
-    out: Array, first: int, noise: Array, probe: Array, told: Array, x: Array, s: Array, v: Array, a: Array, m: Array, c: Array,
-    d: Array, g: Array, speed_track: Array, load_track: Array,
+    out: Array, first: int, noise: Array, probe: Array, told: Array, x: Array, s: Array, v: Array, a: Array,
+    m: Array, c: Array, d: Array, g: Array, speed_track: Array, load_track: Array,
 ) -> None:
-    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2), probe (4, n), told (T_SIZE, n); x, s, v, a move on."""
+    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2), probe (4, n), told (T_SIZE, n).
+
+    x, s, v, a are moved on.
+    """
     period = d[D_PERIOD]
     substeps = int(d[D_SUBSTEPS])
     free_shaft = d[D_FREE_SHAFT] != 0.0
