@@ -101,8 +101,8 @@ WAITS = {"angle_source": "companion"}
 PROBING = {"m1": 9.0, "m2": 4.2}
 """Amplitude [V peak] of the probing signal at a start from standstill; see tools.standstill."""
 LIGHT = {"m1": 0.5, "m2": 1.0}
-"""Load of the starts from rest, as a share of rated.  At rated torque L_q of the saturating M1 is a third smaller
-for a change than the companion is told; the angle then swings with the torque, and the speed loop with the angle."""
+"""Load of the starts from rest, as a share of rated.  At rated torque the incremental L_q of the saturating M1 is a
+third smaller than the companion is told; the angle then swings with the torque, and the speed with the angle."""
 MACHINES = tuple((motor, share) for motor in ("m1", "m2") for share in (0.2, 0.1))
 
 
