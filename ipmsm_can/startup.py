@@ -6,9 +6,9 @@
     KNOWN    the rotor stands still and its angle is known: the axis goes on correcting the observer
     REFUSED  the answer is equal both ways: the polarity cannot be known at standstill, and nobody guesses
 
-It advances by windows of samples, counted from the first sample on, so any partition into blocks gives the same
-bits; what it asks of the drive is `pulses`.  While the rotor turns fast enough for its back-EMF to show, no pulses
-are wanted: then the observer tells north from south by itself.
+It advances by windows of unbroken samples, so any partition into blocks gives the same bits; a lost sample begins
+its window anew, for nobody knows its voltage.  What it asks of the drive is `pulses`.  While the rotor turns fast
+enough for its back-EMF to show, no pulses are wanted: then the observer tells north from south by itself.
 """
 
 from __future__ import annotations
@@ -113,11 +113,11 @@ class StartUp:
         self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n)
         self._back_emf = self._load = 0j
         self._count = 0
+        self._wasted = 0
         self._pause = 0
         self._tries = 0
         self._lost = 0
-        self._last_flags = 0
-        self._last_peak = 0.0
+        self._last_peak = self._raised = 0.0
         self._begin_axis()
 
     @property
@@ -128,8 +128,9 @@ class StartUp:
     @property
     def busy(self) -> bool:
         """Whether it needs every sample as it comes."""
+        # Asked of the estimator, which may have gone on without the start-up since the last window.
         return self.possible and self.phase is not Phase.REFUSED and not (
-            self.phase is Phase.WATCH and self._last_flags & confidence.POLARITY_KNOWN)
+            self.phase is Phase.WATCH and self.estimator.polarity_known)
 
     @property
     def pulses(self) -> Pulses | None:
@@ -141,13 +142,13 @@ class StartUp:
         if not self.possible:
             return self.estimator.process(samples, gap)
         n = samples.shape[1]
-        breaks = set(np.flatnonzero(gap).tolist())
+        stops = np.append(np.union1d(np.flatnonzero(gap), np.flatnonzero(filled) + 1), n)
         parts = []
         begin = 0
         while begin < n:
-            if begin in breaks:
+            if gap[begin]:
                 self._interrupt(int(gap[begin]))
-            end = min([n, *(k for k in breaks if k > begin)])
+            end = int(stops[np.searchsorted(stops, begin, side="right")])
             if self.phase is not Phase.REFUSED:
                 end = min(end, begin + self.n - self._count)
             part = np.ascontiguousarray(samples[:, begin:end])
@@ -158,8 +159,13 @@ class StartUp:
             if self.phase is not Phase.WATCH:
                 window_block(part, filled[start:end], self._window)
             self._count += end - start
-            if self._count == self.n:
+            lost = bool(filled[end - 1])
+            full = self._count == self.n and not lost
+            self._wasted += self._count if lost else 0
+            if full or self._wasted >= self.n:
                 self._judge(int(parts[-1].flags[-1]), float(parts[-1].sigma[-1]))
+                self._wasted = 0
+            if full or lost:
                 self._begin_window()
         return parts[0] if len(parts) == 1 else _joined(parts)
 
@@ -197,10 +203,9 @@ class StartUp:
         elif self.phase in (Phase.AXIS, Phase.PULSES):
             self._to(Phase.AXIS)
 
-    # At the end of each window
+    # At the end of each window, and where as many samples went by without one
 
     def _judge(self, flags: int, known_to: float) -> None:
-        self._last_flags = flags
         known = flags & confidence.POLARITY_KNOWN != 0
         if self.phase is Phase.WATCH:
             self._pause = max(0, self._pause - 1)
@@ -213,7 +218,8 @@ class StartUp:
         self._load += 0.25 * (0.5 * complex(self._window["first"][0] + self._window["i"][0]) - self._load)
         sigma = math.hypot(sigma, _MODEL_SIGMA, self._turned / max(float(self._window["voltage"][0]), 1e-9),
                            _LOAD_SIGMA * (abs(self._load) / self.settings.current) ** 2)
-        if not self._window["broken"][0]:
+        broken = bool(self._window["broken"][0])
+        if not broken:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)
         still = abs(self._back_emf) < self._still_below
         if self.phase is Phase.AXIS:
@@ -221,7 +227,7 @@ class StartUp:
                 self._to(Phase.WATCH)
             elif still and sigma < _WINDOW_SIGMA:
                 self._find_axis(theta, sigma)
-            else:
+            elif not broken:
                 self._begin_axis()
         elif self.phase is Phase.PULSES:
             self._track(theta, sigma)
@@ -265,6 +271,8 @@ class StartUp:
             self._pause = round(_PAUSE_S * self._rate / self.n)
             self._to(Phase.REFUSED if self._tries >= _TRIES else Phase.WATCH)
             return
+        if self._window["broken"][0]:
+            return
         self.evidence.add(*polarity.curvature(self._window, self._noise))
         self._aim(float(self._window["peak"][0]), float(self._window["voltage"][0]))
         verdict = self.evidence.verdict
@@ -282,9 +290,11 @@ class StartUp:
         if peak > _TOO_MUCH * current:
             self._amplitude = min(self._amplitude, voltage) * TARGET * current / peak
         elif (abs(peak - self._last_peak) < _SETTLED * peak and voltage > _APPLIED * self._amplitude
-              and peak < 0.9 * TARGET * current):
-            self._amplitude = min(most, self._amplitude * min(_LARGEST_STEP, TARGET * current / peak))
-            peak = 0.0  # the next two windows are on their way
+              and self._raised < peak < 0.9 * TARGET * current):
+            more = min(_LARGEST_STEP, TARGET * current / peak, most / self._amplitude)
+            self._amplitude *= more
+            # Until half of it shows, it is still on its way: a bus takes its time, and so does the drive's ramp.
+            self._raised = peak * (0.5 + 0.5 * more)
         self._last_peak = peak
 
     def _judge_known(self, still: bool, known_to: float, theta: float, sigma: float) -> None:
@@ -309,7 +319,7 @@ class StartUp:
             self._look_along(self.angle)
             triangle = 4.0 * self.frequency * self._motor.L_d  # V per A of its peak
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
-            self._last_peak = 0.0
+            self._last_peak = self._raised = 0.0
             self._windows_left = round(_PULSES_S * self._rate / self.n)
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.wire.protocol import Protocol
-from tools.closed_loop import RUNNING, START, Case, Run, run
+from tools.closed_loop import RUNNING, START, WAITS, Case, Run, from_rest, run
 
 T = M2.rated_torque
 STEP = Profile(((0.0, 1000.0 * RPM), (1.0, 1000.0 * RPM)), ((0.0, 0.0), (0.55, 0.0), (0.55, T)), 0.9)
@@ -83,6 +84,36 @@ def test_no_frame_acts_on_a_sample_taken_before_it_arrives() -> None:
     faults = BusFaults(delay_ns=300_000, jitter_ns=900_000, reordering=0.1)
     CoSimulation([drive], companion, faults, period_s=1e-3).run(0.1)
     assert drive.heard > 80
+
+
+@pytest.mark.parametrize("firmware", [False, True], ids=["package", "C library"])
+def test_a_rated_load_step_through_the_c_library(firmware: bool, encoder: Run) -> None:
+    """What the library makes of the estimates controls the drive as what the package makes of them."""
+    result = slice_of(STEP, RUNNING, "riccati", firmware=firmware)
+    assert result.kept() and np.abs(result.angle_error).max() < 5.0
+    assert result.dip() / encoder.dip() == pytest.approx(1.42, abs=0.08)
+
+
+@pytest.mark.parametrize(("motor", "saturation", "theta_0", "firmware"), [
+    ("m1", 0.2, 2.9, False), ("m2", 0.2, -2.0, True), ("m2", 0.1, 1.0, False)])
+def test_from_an_unknown_angle_to_speed(motor: str, saturation: float, theta_0: float, firmware: bool) -> None:
+    """Axis, pulses, valid; the drive closes its loop as soon as it listens (1024 samples) and turns."""
+    track = Profile(((0.0, 0.0), (0.4, 0.0), (0.7, 500.0 * RPM), (0.8, 500.0 * RPM)), ((0.0, 0.0),), 0.8)
+    case = from_rest(motor, saturation, theta_0=theta_0, firmware=firmware)
+    result = run(replace(case, profile=track), "riccati")
+    assert [state for _, state in result.states] == [AngleState.HOLD, AngleState.COMPANION]
+    assert result.states[1][0] < 0.35
+    assert result.kept() and np.abs(result.angle_error).max() < 15.0
+
+
+def test_a_brake_holds_the_load_until_the_loop_is_closed() -> None:
+    track = Profile(((0.0, 0.0), (0.4, 0.0), (0.5, 200.0 * RPM), (0.6, 200.0 * RPM)), ((0.0, 0.5 * T),), 0.6)
+    result = slice_of(track, {**WAITS, "brake": True}, "riccati", rough={"saturation": 0.2})
+    assert [state for _, state in result.states] == [AngleState.HOLD, AngleState.COMPANION]
+    released = int(result.states[1][0] * 5000.0)
+    assert not result.truth.omega_e[:released].any() and np.ptp(result.truth.theta_e[:released]) == 0.0
+    assert result.truth.omega_e[released + 5] < 0.0  # the load pulls, and the speed control catches it
+    assert result.kept()
 
 
 @pytest.mark.parametrize("source", ["ges", "riccati"])

@@ -53,7 +53,7 @@ def test_defaults() -> None:
     }
     assert config.observer.model_dump() == {
         "kind": "riccati", "alpha": None, "gamma": None, "initial_flux": (0.0, 0.0), "epsilon": None,
-        "excitation_window": 0.1, "speed_bandwidth": 20.0, "voltage_uncertainty": 0.5, "current_noise": 0.02,
+        "excitation_window": 0.1, "speed_bandwidth": 100.0, "voltage_uncertainty": 0.5, "current_noise": 0.02,
         "resistance_uncertainty": 12.0, "inductance_uncertainty": 6.0, "adapt_voltage": True,
         "adapt_resistance": True, "voltage_delay": "auto",
     }
@@ -363,7 +363,8 @@ def test_every_key_of_the_simulated_drive_arrives() -> None:
         "sample_rate": 8000.0, "substeps": 3, "v_dc": 300.0, "current_bandwidth": 150.0, "speed_bandwidth": 7.0,
         "torque_limit": 4.0, "i_max": 3.0, "mtpa": True, "dead_time_voltage": 0.5, "dead_time_zone": 0.1,
         "current_noise": 0.03, "current_offset": (0.1, -0.2), "adc_step": 0.005, "friction": 0.001,
-        "speed_imposed": True, "rotor_locked": False, "injection_limit": 20.0, "injection_ramp": 500.0,
+        "speed_imposed": True, "rotor_locked": False, "brake": True, "injection_limit": 20.0,
+        "injection_ramp": 500.0,
     }
     sent = {"fd": True, "timing_rate": 20.0, "status_rate": 5.0, "reference_rate": 0.0,
             "encoder_counts": 4096}

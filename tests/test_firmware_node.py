@@ -17,6 +17,7 @@ from ipmsm_can.cli import main
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive import firmware_library
+from ipmsm_can.drive.angle_source import AngleState
 from ipmsm_can.drive.firmware import (
     ANGLE_INVALID,
     ANGLE_MISSING,
@@ -97,8 +98,9 @@ def test_the_same_frames(rate: float, fd: bool) -> None:
 class OnTheCodes(DriveSimulation):
     """A drive whose sensors measure in the steps of the wire, so that nothing lies halfway between two codes."""
 
-    def run(self, n: int, probe: NDArray[np.float64] | None = None) -> DriveSamples:
-        samples = super().run(n, probe)
+    def run(self, n: int, probe: NDArray[np.float64] | None = None,
+            told: NDArray[np.float64] | None = None) -> DriveSamples:
+        samples = super().run(n, probe, told)
         steps = {"i_alpha": 0.005, "i_beta": 0.005, "v_alpha": 0.025, "v_beta": 0.025, "omega_e": 0.25}
         return replace(samples, theta_e=np.round(samples.theta_e, 3),
                        **{name: step * np.round(getattr(samples, name) / step) for name, step in steps.items()})
@@ -214,6 +216,53 @@ def test_the_angle_is_used_while_the_companion_answers_and_refused_after() -> No
     assert usable[10_040]
     counts = drive.counts()
     assert counts.estimates.ok > 1900 and counts.estimates[1:] == (0, 0, 0, 0)
+
+
+def estimate(counter: int, sample: int, theta: float, omega: float) -> FrameBlock:
+    kind = MessageKind.POSITION_ESTIMATE
+    raw = PROTOCOL.encode(kind, 3, {
+        "theta_e": PROTOCOL.angle(kind, "theta_e", theta), "omega_e": omega, "sample_counter": sample & 1023,
+        "sigma_theta": 4.0, "valid": 1.0, "locked": 1.0, "polarity_known": 1.0, "injecting": 0.0}, counter)
+    return FrameBlock(raw, np.zeros(1, np.int64))
+
+
+@pytest.mark.parametrize("drive", [
+    {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3},
+    {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3, "angle_sigma_limit": 3.0},
+    {"angle_source": "companion", "brake": True},
+    {"angle_source": "companion", "estimate_time_to_live": 0.005, "open_loop_current": 2.0},
+], ids=["swap", "too uncertain", "wait", "silence"])
+def test_the_control_runs_on_what_the_library_says(drive: dict[str, Any]) -> None:
+    """The same estimates to both drives, the last 8 ms apart: the same states at the same samples, the same status
+    frames, and the same angle but for single precision."""
+    found = []
+    for kind in (DriveNode, FirmwareNode):
+        node = kind(PROTOCOL, 3, simulated(5000.0, **drive), DriveNodeSettings())
+        steps = []
+        for k in range(400):
+            if k % 4 and k < 390:
+                now = node.simulation.next_sample
+                node.receive(estimate(k - k // 4, max(0, now - 4), 0.2 + 0.01 * now, 50.0))
+            elif k == 395:
+                node.receive(estimate(k, 0, 0.0, 0.0))  # far too old
+            steps.append(node.step(5))
+        found.append(steps)
+    ours, theirs = ([{name: np.concatenate([getattr(s.samples, name) for s in steps])
+                      for name in ("angle_state", "control_theta", "omega_e", "i_q")} for steps in found])
+    assert np.array_equal(ours["angle_state"], theirs["angle_state"])
+    assert len(set(ours["angle_state"])) > 1
+    used = ours["angle_state"] == AngleState.COMPANION
+    apart = np.angle(np.exp(1j * (ours["control_theta"] - theirs["control_theta"])))
+    assert np.abs(apart[used]).max(initial=0.0) < 1e-5
+    assert used.any() == ("angle_sigma_limit" not in drive)
+    assert np.abs(ours["omega_e"] - theirs["omega_e"]).max() < 0.5
+    frames = [together(steps) for steps in found]
+    kinds = [block.take(np.isin(block.can_id, [PROTOCOL.base_ids[k] + 3 for k in (
+        MessageKind.DRIVE_STATUS, MessageKind.DRIVE_TIMING)])) for block in frames]
+    assert np.array_equal(kinds[0].raw, kinds[1].raw) and np.array_equal(kinds[0].t_ns, kinds[1].t_ns)
+    reference = [np.count_nonzero(block.can_id == PROTOCOL.base_ids[MessageKind.DRIVE_REFERENCE] + 3)
+                 for block in frames]
+    assert reference[0] == reference[1] == (150 if "encoder_fails_at" in drive else 200)
 
 
 def test_another_database_is_refused(tmp_path: Path) -> None:

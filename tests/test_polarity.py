@@ -324,10 +324,12 @@ def test_a_rotor_that_starts_to_turn_keeps_its_polarity() -> None:
     assert valid[(counter > 1000) & (counter < 1500)].all()
 
 
+@pytest.mark.parametrize("lost", [(), (40, 90, 91, 410)])
 @pytest.mark.parametrize(("case", "pause", "end"), [
     (HARD, 12, Phase.KNOWN), (LINEAR, 12, Phase.REFUSED), (LINEAR, 4000, Phase.PULSES)],
     ids=["known", "refused", "refused, and a pause"])
-def test_any_partition_gives_the_same_bits(case: standstill.Case, pause: int, end: Phase) -> None:
+def test_any_partition_gives_the_same_bits(case: standstill.Case, pause: int, end: Phase,
+                                           lost: tuple[int, ...]) -> None:
     """A long pause ends a refusal where it stands, not at the end of the block."""
     cosim = standstill.cosimulation(case, 9, True, {})
     cosim.run(0.3)
@@ -346,7 +348,8 @@ def test_any_partition_gives_the_same_bits(case: standstill.Case, pause: int, en
             at = 300 if pause == 12 else 1200
             if a <= at < b:
                 gap[at - a] = pause
-            parts.append(startup.process(np.ascontiguousarray(samples[:, a:b]), gap, np.zeros(b - a, np.uint8)))
+            filled = np.isin(np.arange(a, b), lost).astype(np.uint8)
+            parts.append(startup.process(np.ascontiguousarray(samples[:, a:b]), gap, filled))
         assert startup.phase is end
         assert end is Phase.KNOWN or not any(np.any(p.flags & confidence.VALID) for p in parts)
         outcomes.append((np.concatenate([p.flux for p in parts], axis=1), np.concatenate([p.flags for p in parts]),
@@ -370,6 +373,24 @@ def test_a_drive_that_does_not_answer_is_not_asked_for_ever() -> None:
         startup.process(np.ascontiguousarray(samples), np.zeros(24, np.int64), np.zeros(24, np.uint8))
         tries += before is Phase.PULSES and startup.phase is not Phase.PULSES
     assert (tries, startup.phase) == (3, Phase.REFUSED)
+
+
+def test_pulses_end_where_no_window_is_ever_whole() -> None:
+    """Every tenth sample lost: nothing can be learned, and the pulses do not go on for ever."""
+    cosim = standstill.cosimulation(SOFT, 1, True, {})
+    node: Any = cosim.companion.nodes[0]
+    while node.startup is None or node.startup.phase is not Phase.PULSES:
+        cosim.run(0.005)
+    startup = node.startup
+    samples = np.concatenate([t.run.values for t in cosim.recording.tracked[0]], axis=1)[:, -48:-24]
+    filled = np.zeros(24, np.uint8)
+    filled[5::10] = 1
+    lasted = 0
+    while startup.phase is Phase.PULSES:
+        startup.process(np.ascontiguousarray(samples), np.zeros(24, np.int64), filled)
+        lasted += 24
+    assert 0.35 * RATE < lasted < 0.5 * RATE
+    assert startup.evidence.windows == 0
 
 
 def test_the_words_are_in_the_database() -> None:

@@ -168,7 +168,7 @@ def test_a_gap_is_carried_over_with_the_delay(delay: float) -> None:
     keep[4000:4050] = False
     gap = np.zeros(keep.sum(), np.int64)
     gap[4000] = 50
-    out = estimator(voltage_delay=delay).process(np.ascontiguousarray(samples[:, keep]), gap)
+    out = estimator(voltage_delay=delay, speed_bandwidth=20.0).process(np.ascontiguousarray(samples[:, keep]), gap)
     error = np.abs(degrees_between(out.angle[speed.THETA_HAT], theta[keep]))
     # The speed loop sees the rotor stand still while the first samples are held back: 3.6 deg a sample.
     assert error[4000:4100].max() < 0.8

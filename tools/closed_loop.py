@@ -1,9 +1,10 @@
 """The loop closed over CAN: `python -m tools.closed_loop`.
 
-The simulated drive (M2, 5 kHz) controls speed and current with the angle that comes back from the companion as
+The simulated drive (5 kHz) controls speed and current with the angle that comes back from the companion as
 PositionEstimate at 1 kHz.  Both look at the bus in every control period, so that a delay means what it says; frames
 are delayed and lost in both directions.  Each case is run once with the encoder in the loop throughout and once for
-each observer; the speed error after a rated load step is compared.
+each observer; the speed error after a rated load step is compared.  Then come starts from angles all around: at
+standstill, by injection and polarity pulses, and open loop.
 """
 
 from __future__ import annotations
@@ -24,23 +25,24 @@ from ipmsm_can.bus.cosim import BusFaults, CoSimulation
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.angle_source import AngleState
+from ipmsm_can.drive.firmware import FirmwareNode
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSamples, DriveSimulation
-from ipmsm_can.motor import M2
+from ipmsm_can.motor import M2, PRESETS
 from ipmsm_can.wire.protocol import Protocol
 
 RATE = 5000.0
-FAST_SPEED_LOOP = 100.0
-"""Natural frequency [Hz] of the companion's speed loop; its default, 20 Hz, is too near the drive's own 15 Hz."""
 AFTER_STEP = 0.4
 """Time after a load step in which the largest speed error counts [s]."""
 SOURCES: dict[str, dict[str, Any]] = {
-    "encoder": {}, "ges": {"kind": "ges", "speed_bandwidth": FAST_SPEED_LOOP},
-    "riccati": {"kind": "riccati", "speed_bandwidth": FAST_SPEED_LOOP},
+    "encoder": {}, "ges": {"kind": "ges"}, "riccati": {"kind": "riccati"},
     "ges, 20 Hz": {"kind": "ges", "speed_bandwidth": 20.0},
     "riccati, 20 Hz": {"kind": "riccati", "speed_bandwidth": 20.0},
+    "ges, 60 Hz": {"kind": "ges", "speed_bandwidth": 60.0},
+    "riccati, 60 Hz": {"kind": "riccati", "speed_bandwidth": 60.0},
 }
+"""Settings of the observer; the natural frequency of its speed loop is to be well above the drive's 15 Hz."""
 BUS = {
     "ideal": BusFaults(),
     "0.5 ms": BusFaults(loss=0.01, delay_ns=500_000, seed=1),
@@ -61,6 +63,12 @@ CRAWL = Profile(((0.0, 200.0 * RPM), (0.6, 200.0 * RPM), (1.0, 20.0 * RPM), (5.0
                  (6.4, -200.0 * RPM)), ((0.0, 0.0), (0.7, 0.0), (0.7, 0.5 * _T)), 6.4)
 STANDSTILL = Profile(((0.0, 1000.0 * RPM), (0.6, 1000.0 * RPM), (1.6, 0.0), (4.0, 0.0)),
                      ((0.0, 0.0), (2.2, 0.0), (2.2, _T), (3.0, _T), (3.0, 0.0)), 4.0)
+FROM_REST = Profile(
+    ((0.0, 0.0), (0.4, 0.0), (0.9, 1000.0 * RPM), (1.4, 1000.0 * RPM), (2.4, -1000.0 * RPM), (2.9, -1000.0 * RPM),
+     (3.4, 0.0), (3.6, 0.0)),
+    ((0.0, 0.0), (1.0, 0.0), (1.0, _T), (1.3, _T), (1.3, 0.0), (2.5, 0.0), (2.5, -_T), (2.8, -_T), (2.8, 0.0)), 3.6)
+"""Standstill, to speed, load step, through zero, load step, and back to rest."""
+LOADED_REST = Profile(((0.0, 0.0), (0.6, 0.0), (1.1, 1000.0 * RPM), (1.4, 1000.0 * RPM)), ((0.0, 0.7 * _T),), 1.4)
 RUNNING = {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.5}
 
 
@@ -70,6 +78,7 @@ class Case:
 
     drive: settings of the sensorless drive.  rough: what the drive has that the companion does not know of.
     scale: the companion's motor parameters by the true ones.  mute_at: time at which the companion dies [s].
+    motor: preset.  firmware: the drive speaks, and takes its angle, through the C library.
     """
 
     name: str
@@ -82,10 +91,33 @@ class Case:
     mute_at: float | None = None
     theta_0: float = 2.5
     seed: int = 0
+    motor: str = "m2"
+    firmware: bool = False
 
 
 FAILS = {"angle_source": "encoder_then_companion", "encoder_fails_at": 1.3}
 START = {"angle_source": "companion", "open_loop_current": M2.rated_current}
+WAITS = {"angle_source": "companion"}
+PROBING = {"m1": 9.0, "m2": 4.2}
+"""Amplitude [V peak] of the probing signal at a start from standstill; see tools.standstill."""
+LIGHT = {"m1": 0.5, "m2": 1.0}
+"""Load of the starts from rest, as a share of rated.  At rated torque the incremental L_q of the saturating M1 is a
+third smaller than the companion is told; the angle then swings with the torque, and the speed with the angle."""
+MACHINES = tuple((motor, share) for motor in ("m1", "m2") for share in (0.2, 0.1))
+
+
+def loaded(profile: Profile, share: float) -> Profile:
+    """The profile with so much of its load."""
+    return replace(profile, load=tuple((t, share * torque) for t, torque in profile.load))
+
+
+def from_rest(motor: str, saturation: float, **more: Any) -> Case:
+    """A start at standstill by injection and pulses, through zero and back to rest."""
+    share = LIGHT[motor]
+    return Case(f"from rest, {motor.upper()}, L_d down {100 * saturation:.0f} %", loaded(FROM_REST, share), WAITS,
+                motor=motor, rough={"saturation": saturation, "torque_limit": (0.5 + share) * _T}, **more)
+
+
 CASES = (
     *(Case("load steps and reversal, encoder fails at 1.3 s", STEPS, FAILS, bus) for bus in BUS),
     Case("the same, started open loop", STEPS, START),
@@ -98,8 +130,13 @@ CASES = (
     Case("half load, from 20 to -20 rpm in 4 s", CRAWL, RUNNING),
     Case("to standstill, rated load there", STANDSTILL, RUNNING),
     Case("companion dies at 1.8 s under rated load", STEPS, FAILS, mute_at=1.8),
-    Case("standstill, wait for the companion", Profile(((0.0, 0.0),), ((0.0, 0.0),), 1.0),
-         {"angle_source": "companion"}),
+    Case("standstill, wait for the companion", Profile(((0.0, 0.0),), ((0.0, 0.0),), 1.0), WAITS),
+    Case("the same drive with the C library, load steps and reversal", STEPS, FAILS, firmware=True),
+    *(from_rest(motor, share) for motor, share in MACHINES),
+    replace(from_rest("m2", 0.2, firmware=True), name="from rest, M2, L_d down 20 %, with the C library"),
+    Case("from rest under 70 % load, brake, M2", LOADED_REST, {**WAITS, "brake": True}, rough={"saturation": 0.2}),
+    Case("from rest under 35 % load, brake, M1", loaded(LOADED_REST, 0.5), {**WAITS, "brake": True}, motor="m1",
+         rough={"saturation": 0.2, "torque_limit": _T}),
 )
 
 
@@ -125,7 +162,7 @@ class Run:
     @property
     def speed_error(self) -> NDArray[np.float64]:
         """Reference minus speed [rpm mechanical], at every sample."""
-        return (self.truth.speed_reference - self.truth.omega_e / M2.pole_pairs) / RPM
+        return (self.truth.speed_reference - self.truth.omega_e / PRESETS[self.case.motor].pole_pairs) / RPM
 
     @property
     def angle_error(self) -> NDArray[np.float64]:
@@ -148,12 +185,16 @@ class Run:
 
 def run(case: Case, source: str) -> Run:
     """Run a case with the encoder or an observer of SOURCES in the loop."""
-    motor = {"preset": "m2", **{name: factor * getattr(M2, name) for name, factor in case.scale.items()}}
-    config = config_from({"motor": motor, "observer": SOURCES[source], "injection": {"enabled": case.injection}})
+    plant = PRESETS[case.motor]
+    motor = {"preset": case.motor, **{name: factor * getattr(plant, name) for name, factor in case.scale.items()}}
+    injection: dict[str, Any] = {"enabled": case.injection}
+    if "saturation" in case.rough:
+        injection["amplitude"] = PROBING[case.motor]
+    config = config_from({"motor": motor, "observer": SOURCES[source], "injection": injection})
     drive = {} if source == "encoder" else case.drive
     parameters = DriveParameters(sample_rate=RATE, **case.rough, **drive)
-    simulation = DriveSimulation(M2, parameters, case.profile, case.theta_0, case.seed)
-    node = DriveNode(_protocol(), 0, simulation, DriveNodeSettings())
+    simulation = DriveSimulation(plant, parameters, case.profile, case.theta_0, case.seed)
+    node = (FirmwareNode if case.firmware else DriveNode)(_protocol(), 0, simulation, DriveNodeSettings())
     companion = Companion([config], _protocol(), transmit=True)
     cosim = CoSimulation([node], companion, replace(BUS[case.bus], seed=case.seed + 1), period_s=1.0 / RATE)
     before = case.profile.duration if case.mute_at is None else case.mute_at
@@ -183,6 +224,26 @@ def _work(job: tuple[Case, str]) -> Run:
     return run(*job)
 
 
+def starts_at_rest(sources: Sequence[str], count: int, workers: int) -> None:
+    """Starts at standstill from `count` angles, each with its own noise and losses."""
+    jobs = [(replace(from_rest(motor, share), theta_0=math.tau * k / count, seed=k), source)
+            for motor, share in MACHINES for source in sources for k in range(count)]
+    print(f"{count} starts at standstill, 1 % lost, 0.5 to 2 ms; load steps, through zero, and back")
+    with ProcessPoolExecutor(workers) as pool:
+        done = pool.map(_work, jobs)
+        for case, source in jobs[::count]:
+            own = [next(done) for _ in range(count)]
+            print(_starts(case, source, own), flush=True)
+
+
+def _starts(case: Case, source: str, own: list[Run]) -> str:
+    swapped = [t for r in own for t, state in r.states if state is AngleState.COMPANION]
+    worst, dip = max(float(np.abs(r.angle_error).max()) for r in own), max(r.dip() for r in own)
+    return (f"  {case.name:32s} {source:10s} kept {sum(r.kept() for r in own)} of {len(own)}, loop closed after "
+            f"{min(swapped, default=math.inf):.3f} to {max(swapped, default=math.inf):.3f} s, angle off by "
+            f"{worst:.1f} deg at most, speed after a step by {dip:.0f} rpm")
+
+
 def start_angles(sources: Sequence[str], count: int, workers: int) -> None:
     """Open-loop starts from `count` angles, each with its own noise and losses."""
     until = Profile(((0.0, 0.0), (0.2, 0.0), (1.2, 1000.0 * RPM), (2.0, 1000.0 * RPM)), ((0.0, 0.0),), 2.0)
@@ -205,7 +266,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--sources", nargs="+", default=["ges", "riccati"], metavar="NAME",
                         choices=[s for s in SOURCES if s != "encoder"], help=f"among {', '.join(SOURCES)}")
     parser.add_argument("--cases", default="", metavar="TEXT", help="only cases whose name holds this text")
-    parser.add_argument("--starts", type=int, default=24, metavar="N", help="open-loop starts (default: 24)")
+    parser.add_argument("--starts", type=int, default=24, metavar="N", help="starts of each kind (default: 24)")
     parser.add_argument("--workers", type=int, default=2, metavar="N", help="processes (default: 2)")
     args = parser.parse_args(argv)
     cases = [case for case in CASES if args.cases in case.name]
@@ -219,6 +280,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"{result.case.name}; bus {result.case.bus}")
             print(line(result, 0.0 if result.source == "encoder" else dip), flush=True)
     if args.starts:
+        starts_at_rest(args.sources, args.starts, args.workers)
         start_angles(args.sources, args.starts, args.workers)
     return 0
 

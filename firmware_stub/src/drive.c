@@ -129,6 +129,14 @@ enum ipmsm_angle_verdict ipmsm_drive_angle(const struct ipmsm_drive *drive, floa
     return verdict;
 }
 
+float ipmsm_drive_speed(const struct ipmsm_drive *drive)
+{
+    const uint32_t before = lock(drive);
+    const float omega_e = drive->receiver.estimate.omega_e;
+    unlock(drive, before);
+    return omega_e;
+}
+
 bool ipmsm_drive_angle_usable(const struct ipmsm_drive *drive)
 {
     float theta_e;

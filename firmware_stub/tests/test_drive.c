@@ -194,6 +194,7 @@ static void the_angle_comes_and_goes(void)
     }
     CHECK(!ipmsm_drive_angle_usable(&drive));
     CHECK(ipmsm_drive_angle(&drive, 0.0f, &theta) == IPMSM_ANGLE_MISSING && theta == -1.0f);
+    CHECK(ipmsm_drive_speed(&drive) == 0.0f);
     v.sample = 1095;
     hear(estimate_frame(6, 0, v));
     ipmsm_drive_receive(&drive);
@@ -202,6 +203,7 @@ static void the_angle_comes_and_goes(void)
     CHECK_NEAR(theta, 1.04f, 3e-4f); /* the latest sample is 1099: 4 periods of 100 us at 100 rad/s */
     CHECK(ipmsm_drive_angle(&drive, 1.5f, &theta) == IPMSM_ANGLE_USABLE);
     CHECK_NEAR(theta, 1.055f, 3e-4f);
+    CHECK_NEAR(ipmsm_drive_speed(&drive), 100.0f, 0.3f);
     for (uint32_t k = 0; k < 96u; k++) {
         CHECK(ipmsm_drive_angle_usable(&drive));
         (void)period();

@@ -165,8 +165,9 @@ class ObserverConfig(Section):
         doc="Length of the window over which excitation, the smallest eigenvalue of the integral of "
             "Phi Phi^T, is judged.", unit=units.SECOND, above=0, most=10)] = 0.1
     speed_bandwidth: Annotated[float, Quantity(
-        doc="Natural frequency of the phase-locked loop that gives the speed.",
-        unit=units.HERTZ, above=0, most=1000)] = 20.0
+        doc="Natural frequency of the phase-locked loop that gives the speed; where a drive controls its speed "
+            "with it, several times the drive's bandwidth.",
+        unit=units.HERTZ, above=0, most=1000)] = 100.0
     voltage_uncertainty: Annotated[float, Quantity(
         doc="What the reported mean voltage may be wrong by (dead time, offsets); widens the reported sigma.",
         unit=units.VOLT, least=0)] = 0.5

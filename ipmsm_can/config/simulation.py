@@ -81,6 +81,9 @@ class SimulationConfig(Section):
             "drive's torque reference.")] = DriveParameters.speed_imposed
     rotor_locked: Annotated[bool, Switch(
         doc="The rotor stays where it starts; torque as with speed_imposed.")] = DriveParameters.rotor_locked
+    brake: Annotated[bool, Switch(
+        doc="A brake holds the shaft until the drive has an angle to control with, with angle_source = "
+            "\"companion\".")] = DriveParameters.brake
     injection_limit: Annotated[float, Quantity(
         doc="Largest probing amplitude the drive makes, whatever it is asked for.", unit=units.VOLT_PEAK,
         least=0)] = DriveParameters.injection_limit

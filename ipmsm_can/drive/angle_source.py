@@ -59,7 +59,8 @@ class AngleState(IntEnum):
 
 
 ENCODER, COMPANION, HOLD, OPEN_LOOP, STOPPED = (int(state) for state in AngleState)
-_USABLE, _MISSING = int(AngleVerdict.USABLE), int(AngleVerdict.MISSING)
+_MISSING = int(AngleVerdict.MISSING)
+USABLE = int(AngleVerdict.USABLE)
 _ENCODER_ONLY, _COMPANION_ONLY, _BOTH = range(len(ANGLE_SOURCES))
 
 # Settings, float64 (G_SIZE,)
@@ -81,6 +82,12 @@ A_VERDICT = 5  # what it says of itself: an AngleVerdict, whatever its age
 A_OPEN_THETA = 6  # rad electrical
 A_OPEN_SPEED = 7  # rad/s electrical, signed
 A_SIZE = 8
+
+# What the control is told of the companion's angle at each sample, float64 (T_SIZE, n)
+T_VERDICT = 0  # an AngleVerdict
+T_THETA = 1  # rad electrical, at the sample; means nothing where it may not be used
+T_OMEGA = 2  # rad/s electrical
+T_SIZE = 3
 
 
 def pack(p: DriveParameters) -> tuple[Array, Array]:
@@ -113,13 +120,23 @@ def verdict(a: Array, g: Array, sample: float) -> int:
 
 
 @kernel
-def choose(a: Array, g: Array, sample: float, wanted: float, may_turn: bool) -> int:
+def tell(out: Array, first: int, a: Array, g: Array, period: float) -> None:
+    """Fill out (T_SIZE, n) for the samples from `first` on, with the estimate held and no other coming in."""
+    for j in range(out.shape[1]):
+        sample = float(first + j)
+        out[T_VERDICT, j] = verdict(a, g, sample)
+        out[T_THETA, j] = extrapolate(a[A_THETA], a[A_OMEGA], (sample - a[A_SAMPLE]) * period)
+        out[T_OMEGA, j] = a[A_OMEGA]
+
+
+@kernel
+def choose(a: Array, g: Array, sample: float, usable: bool, wanted: float, may_turn: bool) -> int:
     """The AngleState of this sample, from the last one; a is moved on.
 
-    wanted: speed reference, whose sign alone counts.  may_turn: the shaft is free, so it can be turned open loop.
+    usable: whether the companion's angle is.  wanted: speed reference, whose sign alone counts.  may_turn: the
+    shaft is free, so it can be turned open loop.
     """
     state = int(a[A_STATE])
-    usable = verdict(a, g, sample) == _USABLE
     if state == ENCODER:
         if sample >= g[G_ENCODER_FAILS]:
             state = COMPANION if g[G_SOURCE] == _BOTH and usable else STOPPED

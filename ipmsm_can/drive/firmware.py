@@ -1,7 +1,8 @@
 """The simulated drive that speaks through the C library of firmware_stub instead of the package's own wire.
 
 The machine, its control and its sensors are those of `DriveSimulation`; frames, checks of what is heard, and the
-probing voltage are the library's, called in every control period as an interrupt would call it.
+probing voltage are the library's, called in every control period as an interrupt would call it; where the control
+runs on the companion's angle, the library decides whether it may and carries the angle on to the sample.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.drive.angle_source import T_SIZE, T_THETA, T_VERDICT
 from ipmsm_can.drive.firmware_library import FirmwareError as FirmwareError
 from ipmsm_can.drive.firmware_library import load
 from ipmsm_can.drive.node import TEMPERATURE, DriveNode, DriveNodeSettings, Step
@@ -74,9 +76,6 @@ class FirmwareNode(DriveNode):
         if protocol.database.source != str(default_dbc_path()):
             raise FirmwareError(f"wire.dbc is {protocol.database.source}; allowed with the C library is the "
                                 "project's own, from which its codec is generated")
-        source = simulation.parameters.angle_source
-        if source != "encoder":
-            raise FirmwareError(f"simulation.angle_source is {source}; allowed with the C library is encoder")
         self._ffi, self._library = load()
         # A cdata of the struct's size; uint64_t makes it aligned.
         self._memory = self._ffi.new("uint64_t[]", (self._library.blocks_size() + 7) // 8)
@@ -86,6 +85,8 @@ class FirmwareNode(DriveNode):
         wanted = self._ffi.new("struct blocks_settings *", {
             "node": node, "fd": settings.fd, "sample_rate": parameters.sample_rate,
             "probing_limit": parameters.injection_limit, "probing_ramp": parameters.injection_ramp,
+            "sigma_limit": parameters.angle_sigma_limit,
+            "estimate_time_to_live_us": round(1e6 * parameters.estimate_time_to_live),
             "timing_every": self.every(settings.timing_rate), "status_every": self.every(settings.status_rate),
             "reference_every": self.every(settings.reference_rate), "v_dc": parameters.v_dc,
             "temperature": TEMPERATURE})
@@ -99,21 +100,27 @@ class FirmwareNode(DriveNode):
 
     def step(self, n: int, t0_ns: int = 0) -> FirmwareStep:
         """Run n samples; frames carry t0_ns plus the time of their sample."""
-        probe = np.empty((4, n))
-        self._library.blocks_rehearse(self._drive, *self._waiting(), n, self._at("double *", probe))
-        s = self.simulation.run(n, probe)
+        probe, told = np.empty((4, n)), np.empty((T_SIZE, n))
+        self._library.blocks_rehearse(self._drive, *self._waiting(), n, self._at("double *", probe),
+                                      self._at("double *", told))
+        s = self.simulation.run(n, probe, told)
         if n:
             self.waveform = Waveform(int(s.injection_waveform[-1]))
         samples = np.array([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta, self.encoder(s.theta_e), s.omega_e])
         out, at = np.empty((4 * n, FRAME_BYTES), np.uint8), np.empty(4 * n, np.int64)
-        verdict, theta_e = np.empty(n, np.uint8), np.empty(n)
+        mode, faults = self._condition(s)
+        at_once = np.zeros(n, np.int64)
+        if self.settings.status_rate > 0.0:
+            at_once[self._changes(s)] = 1
+        condition = np.array([mode, faults, at_once]).astype(np.uint8)
         used = self._ffi.new("size_t *")
         sent = self._library.blocks_run(
-            self._drive, *self._waiting(), n, self._at("double *", samples), self._at("uint8_t *", out),
-            self._at("int64_t *", at), self._at("uint8_t *", verdict), self._at("double *", theta_e), used)
+            self._drive, *self._waiting(), n, self._at("double *", samples), self._at("uint8_t *", condition),
+            self._at("uint8_t *", out), self._at("int64_t *", at), used)
         self._heard = self._heard.take(slice(used[0], None))
         self.rejected = self.counts().rejected
-        return FirmwareStep(FrameBlock(out[:sent].copy(), self.time_of(at[:sent], t0_ns)), s, verdict, theta_e)
+        return FirmwareStep(FrameBlock(out[:sent].copy(), self.time_of(at[:sent], t0_ns)), s,
+                            told[T_VERDICT].astype(np.uint8), told[T_THETA])
 
     def counts(self) -> FirmwareCounts:
         """What became of the frames it heard."""

@@ -168,20 +168,26 @@ class DriveNode:
         due = self._due(s, self.settings.status_rate)
         if self.settings.status_rate > 0.0:
             due = np.union1d(due, self._changes(s))  # what happened to the angle is said at once
-        state = s.angle_state[due]
-        no_angle = (state != AngleState.ENCODER) & (state != AngleState.COMPANION) & self._needs_companion
-        faults = (ENCODER_FAILED * (s.sample[due] >= self._encoder_fails) + NO_ANGLE * no_angle
-                  + (COMMAND_REJECTED if self._refused else 0))
+        mode, faults = self._condition(s)
+        refused = self._refused
         if due.size:
             self._refused = False
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_STATUS, self.node, {
-            "mode": np.where(state == AngleState.STOPPED, DriveMode.SAFE_STOP, DriveMode.RUNNING),
+            "mode": mode[due],
             "active_waveform": s.injection_waveform[due],
             "encoder_available": (s.sample[due] < self._encoder_fails) & (self.settings.reference_rate > 0.0),
-            "faults": faults, "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
+            "faults": faults[due] + (COMMAND_REJECTED if refused else 0),
+            "v_dc": np.full(due.size, self.simulation.parameters.v_dc),
             "temperature": np.full(due.size, TEMPERATURE),
             "protocol_version": np.full(due.size, PROTOCOL_VERSION),
             "rejected_commands": np.full(due.size, self.rejected & 0xFF)})
+
+    def _condition(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(DriveMode, bits of DriveStatus.faults) at every sample; of rejected commands it knows nothing."""
+        state = s.angle_state
+        no_angle = (state != AngleState.ENCODER) & (state != AngleState.COMPANION) & self._needs_companion
+        faults = ENCODER_FAILED * (s.sample >= self._encoder_fails) + NO_ANGLE * no_angle
+        return np.where(state == AngleState.STOPPED, int(DriveMode.SAFE_STOP), int(DriveMode.RUNNING)), faults
 
     def _changes(self, s: DriveSamples) -> NDArray[np.intp]:
         """Samples at which the control went over to something else, or the encoder failed; not the first of all."""

@@ -50,6 +50,7 @@ class DriveParameters:
     speed_imposed: a load machine makes the rotor follow the profile's speed exactly; the drive then
         controls torque, and the profile's load torque is its torque reference.
     rotor_locked: the rotor stays where it starts; torque control as above.
+    brake: a brake holds the shaft, at rest, until the drive has an angle to control with or turns it open loop.
     injection_limit: largest probing amplitude [V peak], >= 0, whatever is asked.
     injection_ramp: fastest change of the probing amplitude [V/s], > 0.
     angle_source: one of ANGLE_SOURCES; the last swaps to the companion's angle when the encoder fails.
@@ -83,6 +84,7 @@ class DriveParameters:
     saturation: float = 0.0
     speed_imposed: bool = False
     rotor_locked: bool = False
+    brake: bool = False
     injection_limit: float = 30.0
     injection_ramp: float = 1000.0
     angle_source: AngleSource = "encoder"

@@ -12,8 +12,8 @@ steps: t_k is then the instant of the current, and the voltage steps `sampling_l
 `voltage_delay` reports an older voltage, or the mean over parts of two.  So the reported voltage is late against
 the current by voltage_delay - sampling_lead.
 
-The probing voltage of a block is made before the block is simulated, by the generator here or by somebody else:
-it depends on commands only, and those come between blocks.
+The probing voltage of a block, and what the control is told of the companion's angle, are made before the block is
+simulated, here or by somebody else: they depend on frames only, and those come between blocks.
 """
 
 from __future__ import annotations
@@ -35,11 +35,17 @@ from ipmsm_can.drive.angle_source import (
     COMPANION,
     ENCODER,
     G_OPEN_CURRENT,
+    HOLD,
     OPEN_LOOP,
     STOPPED,
+    T_OMEGA,
+    T_SIZE,
+    T_THETA,
+    T_VERDICT,
+    USABLE,
     choose,
     coast,
-    extrapolate,
+    tell,
     turn_open_loop,
 )
 from ipmsm_can.drive.control import current_step, regulate_current, speed_step
@@ -80,7 +86,8 @@ D_INJECTION_LIMIT = 10  # V
 D_INJECTION_RAMP = 11  # V/s
 D_VOLTAGE_DELAY = 12  # samples
 D_SAMPLING_LEAD = 13  # samples
-D_SIZE = 14
+D_BRAKE = 14
+D_SIZE = 15
 
 # Voltage state, float64 (V_SIZE,): (alpha, beta) of the interval that ended, then of the one that begins, and of
 # those before the one that ended, latest first
@@ -184,14 +191,18 @@ def _advance_period(x: Array, v: Array, load: float, free_shaft: bool, omega_end
 
 @kernel
 def _simulate(
-    out: Array, first: int, noise: Array, probe: Array, x: Array, s: Array, v: Array, a: Array, m: Array, c: Array,
-    d: Array, g: Array, speed_track: Array, load_track: Array,
+    out: Array, first: int, noise: Array, probe: Array, told: Array, x: Array, s: Array, v: Array, a: Array,
+    m: Array, c: Array, d: Array, g: Array, speed_track: Array, load_track: Array,
 ) -> None:
-    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2), probe (4, n); x, s, v, a are moved on."""
+    """Fill out (O_SIZE, n) with samples first.., from noise (n, 2), probe (4, n), told (T_SIZE, n).
+
+    x, s, v, a are moved on.
+    """
     period = d[D_PERIOD]
     substeps = int(d[D_SUBSTEPS])
     free_shaft = d[D_FREE_SHAFT] != 0.0
     locked = d[D_LOCKED] != 0.0
+    braked = free_shaft and d[D_BRAKE] != 0.0
     pole_pairs = m[M_POLE_PAIRS]
     for j in range(out.shape[1]):
         k = float(first + j)
@@ -233,7 +244,8 @@ def _simulate(
         out[15, j] = probe[3, j]
         load_mean = 0.5 * (load + value_at(load_track, k + 1.0, True))
         omega_end = 0.0 if locked else value_at(speed_track, k + 1.0, True)
-        state = choose(a, g, k, reference, free_shaft)
+        state = choose(a, g, k, told[T_VERDICT, j] == USABLE, reference, free_shaft)
+        held = braked and state == HOLD
         out[16, j] = state
         out[17, j] = math.nan
         if state == STOPPED:
@@ -246,8 +258,8 @@ def _simulate(
             v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta_e, omega_e, torque,
                                            inj_alpha, inj_beta)
         elif state == COMPANION:
-            omega = a[A_OMEGA]
-            theta = extrapolate(a[A_THETA], omega, (k - a[A_SAMPLE]) * period)
+            omega = told[T_OMEGA, j]
+            theta = told[T_THETA, j]
             out[17, j] = wrap(theta)
             torque = speed_step(s, c, omega / pole_pairs, reference) if free_shaft else load
             v_alpha, v_beta = current_step(s, c, measured_alpha, measured_beta, theta, omega, torque,
@@ -261,7 +273,7 @@ def _simulate(
             v_alpha, v_beta = regulate_current(s, c, measured_alpha, measured_beta, 0.0, 0.0, 0.0, 0.0,
                                                inj_alpha, inj_beta)
 
-        _advance_period(x, v, load_mean, free_shaft, omega_end, m, d)
+        _advance_period(x, v, load_mean, free_shaft and not held, 0.0 if held else omega_end, m, d)
         for place in range(V_SIZE - 1, V_PAST + 1, -1):
             v[place] = v[place - 2]
         for axis in range(2):
@@ -298,10 +310,11 @@ class DriveSimulation:
         self._drive = np.array([
             period, p.substeps, not (p.speed_imposed or p.rotor_locked), p.rotor_locked,
             p.dead_time_voltage, p.dead_time_zone, p.current_noise, *p.current_offset, p.adc_step,
-            p.injection_limit, p.injection_ramp, p.voltage_delay, p.sampling_lead,
+            p.injection_limit, p.injection_ramp, p.voltage_delay, p.sampling_lead, p.brake,
         ], dtype=np.float64)
         self._speed_track, self._load_track = profile.tracks(p.sample_rate)
-        omega_m = 0.0 if p.rotor_locked else value_at(self._speed_track, 0.0, False)
+        at_rest = p.rotor_locked or (p.brake and not p.speed_imposed and p.angle_source == "companion")
+        omega_m = 0.0 if at_rest else value_at(self._speed_track, 0.0, False)
         self._x = machine.initial_state(motor, theta_0, omega_m)
         self._s = np.zeros(control.S_SIZE)
         self._v = np.zeros(V_SIZE)
@@ -361,11 +374,13 @@ class DriveSimulation:
         self._angle[A_OMEGA] = estimate.omega_e
         self._angle[angle_source.A_VERDICT] = estimate.verdict
 
-    def run(self, n: int, probe: Array | None = None) -> DriveSamples:
+    def run(self, n: int, probe: Array | None = None, told: Array | None = None) -> DriveSamples:
         """The next n samples, n >= 0.
 
         probe: float64 (4, n), what is decided at each of them in place of the generator here: probing voltage
         (alpha, beta) [V] for the interval from t_(k+1) on, waveform 0..3, amplitude [V peak].
+        told: float64 (3, n), what the control is told of the companion's angle at each of them in place of the
+        estimates taken here: an AngleVerdict, theta at t_k [rad electrical], omega [rad/s electrical].
         """
         if n < 0:
             raise ValueError(f"n is {n!r}; allowed is 0 or more samples")
@@ -374,9 +389,14 @@ class DriveSimulation:
             _probe(probe, self._injection, self._drive)
         elif probe.shape != (4, n):
             raise ValueError(f"probe has the shape {probe.shape}; allowed is (4, {n})")
+        if told is None:
+            told = np.empty((T_SIZE, n))
+            tell(told, self._next, self._angle, self._angle_settings, self._drive[D_PERIOD])
+        elif told.shape != (T_SIZE, n):
+            raise ValueError(f"told has the shape {told.shape}; allowed is ({T_SIZE}, {n})")
         out = np.empty((O_SIZE, n))
         noise = self._noise.standard_normal((n, 2))
-        _simulate(out, self._next, noise, probe, self._x, self._s, self._v, self._angle, self._machine,
+        _simulate(out, self._next, noise, probe, told, self._x, self._s, self._v, self._angle, self._machine,
                   self._control, self._drive, self._angle_settings, self._speed_track, self._load_track)
         sample = np.arange(self._next, self._next + n, dtype=np.int64)
         self._next += n

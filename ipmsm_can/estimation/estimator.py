@@ -160,6 +160,12 @@ class Estimator:
         """How late the voltage is against the current: set right, and found."""
         return timing.known(self._regression["timing"])
 
+    @property
+    def polarity_known(self) -> bool:
+        """Whether north is told from south as of the last sample."""
+        state = self._observer if KINDS[self.settings.kind] == RICCATI else self._confidence
+        return bool(state[0]["polarity"])
+
     def process(self, samples: Floats, gap: NDArray[np.int64] | None = None) -> EstimateBlock:
         """Run a block.
 
@@ -204,7 +210,7 @@ class Estimator:
             o["theta"], o["known"] = own + math.pi * round((theta - own) / math.pi), 1
             c["polarity"] = 1
             return
-        unknown = not (o if kind == RICCATI else c)["polarity"]
+        unknown = not self.polarity_known
         i = complex(r["i_a"], r["i_b"])
         x = complex(o["lambda_a"], o["lambda_b"]) - self._assumed.L_q * i
         north = complex(math.cos(theta), math.sin(theta))

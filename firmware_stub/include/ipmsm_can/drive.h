@@ -66,6 +66,9 @@ enum ipmsm_angle_verdict ipmsm_drive_angle(const struct ipmsm_drive *drive, floa
 /* The same question without the angle. */
 bool ipmsm_drive_angle_usable(const struct ipmsm_drive *drive);
 
+/* Speed of the last estimate [rad/s electrical], 0 before the first; to be used only where the angle may. */
+float ipmsm_drive_speed(const struct ipmsm_drive *drive);
+
 /* Background messages; false if there was no room (or, for timing, no sample was sent yet). */
 bool ipmsm_drive_timing(struct ipmsm_drive *drive);
 bool ipmsm_drive_status(struct ipmsm_drive *drive, const struct ipmsm_status *status);

@@ -114,10 +114,8 @@ bool blocks_init(struct blocks_drive *blocks, const struct blocks_settings *sett
     config.sample_rate = settings->sample_rate;
     config.probing_limit = settings->probing_limit;
     config.probing_ramp = settings->probing_ramp;
-    const float longest_us = 1e9f / settings->sample_rate; /* ten bits of the sample counter, less a little */
-    if ((float)config.estimate_time_to_live_us > longest_us) {
-        config.estimate_time_to_live_us = (uint32_t)longest_us;
-    }
+    config.sigma_limit = settings->sigma_limit;
+    config.estimate_time_to_live_us = settings->estimate_time_to_live_us;
     if (!ipmsm_drive_init(&blocks->drive, &config, &blocks->hal)) {
         return false;
     }
@@ -135,7 +133,7 @@ static void control_period(struct blocks_drive *blocks, const struct ipmsm_sampl
 }
 
 void blocks_rehearse(const struct blocks_drive *blocks, const uint8_t *heard, size_t count, size_t n,
-                     double *probe)
+                     double *probe, double *told)
 {
     const struct ipmsm_sample sample = {0.0f, 0.0f, 0.0f, 0.0f};
     struct blocks_drive copy = *blocks;
@@ -146,11 +144,15 @@ void blocks_rehearse(const struct blocks_drive *blocks, const uint8_t *heard, si
     for (size_t j = 0; j < n; j++) {
         float v_alpha;
         float v_beta;
+        float angle = NAN;
         control_period(&copy, &sample, &v_alpha, &v_beta);
         probe[j] = (double)v_alpha;
         probe[n + j] = (double)v_beta;
         probe[2u * n + j] = (double)copy.drive.probing.waveform;
         probe[3u * n + j] = (double)copy.drive.probing.amplitude;
+        told[j] = (double)ipmsm_drive_angle(&copy.drive, 0.0f, &angle);
+        told[n + j] = (double)angle;
+        told[2u * n + j] = (double)ipmsm_drive_speed(&copy.drive);
         copy.period++;
     }
 }
@@ -161,16 +163,10 @@ static bool is_due(uint64_t period, uint32_t every)
 }
 
 size_t blocks_run(struct blocks_drive *blocks, const uint8_t *heard, size_t count, size_t n,
-                  const double *samples, uint8_t *out, int64_t *at, uint8_t *verdict, double *theta_e,
-                  size_t *used)
+                  const double *samples, const uint8_t *condition, uint8_t *out, int64_t *at, size_t *used)
 {
     const struct blocks_settings *settings = &blocks->settings;
-    const struct ipmsm_status status = {
-        .mode = IPMSM_RUNNING,
-        .encoder_available = settings->reference_every != 0u,
-        .v_dc = settings->v_dc,
-        .temperature = settings->temperature,
-    };
+    struct ipmsm_status status = {.v_dc = settings->v_dc, .temperature = settings->temperature};
     blocks->heard = heard;
     blocks->heard_end = &heard[ROW * count];
     blocks->out = out;
@@ -185,17 +181,18 @@ size_t blocks_run(struct blocks_drive *blocks, const uint8_t *heard, size_t coun
         };
         float v_alpha;
         float v_beta;
-        float angle = NAN;
         control_period(blocks, &sample, &v_alpha, &v_beta);
-        verdict[j] = (uint8_t)ipmsm_drive_angle(&blocks->drive, 0.0f, &angle);
-        theta_e[j] = (double)angle;
         if (is_due(blocks->period, settings->timing_every)) {
             (void)ipmsm_drive_timing(&blocks->drive);
         }
-        if (is_due(blocks->period, settings->status_every)) {
+        status.mode = (enum ipmsm_mode)condition[j];
+        status.faults = condition[n + j];
+        status.encoder_available =
+            settings->reference_every != 0u && (status.faults & IPMSM_FAULT_ENCODER) == 0u;
+        if (is_due(blocks->period, settings->status_every) || condition[2u * n + j] != 0u) {
             (void)ipmsm_drive_status(&blocks->drive, &status);
         }
-        if (is_due(blocks->period, settings->reference_every)) {
+        if (status.encoder_available && is_due(blocks->period, settings->reference_every)) {
             (void)ipmsm_drive_reference(&blocks->drive, (float)samples[4u * n + j], (float)samples[5u * n + j],
                                         (uint32_t)blocks->period);
         }
