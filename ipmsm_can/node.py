@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.config.build import estimator_settings, injection_settings
+from ipmsm_can.config.build import estimator_settings, injection_settings, startup_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import clipping, confidence, speed
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
@@ -17,6 +17,7 @@ from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.injection import meter
 from ipmsm_can.injection.scheduler import Command, InjectionScheduler
+from ipmsm_can.startup import Phase, StartUp
 from ipmsm_can.wire.answers import (
     FLUX_SIGNALS,
     POSITION_SIGNALS,
@@ -33,12 +34,18 @@ from ipmsm_can.wire.protocol import (
     MessageKind,
     ObserverKind,
     Protocol,
+    Waveform,
 )
 from ipmsm_can.wire.receive import SampleReceiver
 from ipmsm_can.wire.sequence import CLIPPED, SampleRun
 
 STALE_AFTER_NS = 50_000_000
 """Silence of the drive [ns] after which nothing is claimed any more."""
+STARTUP_PERIOD = 0.005
+"""Time between commands [s] while the start-up waits for what they bring about."""
+PULSES_TIME_TO_LIVE = 0.03
+"""Time to live of polarity pulses [s], or the waveform's if that is less: at their current no drive is to be
+without orders for long."""
 OLDEST_ANSWER = 0.02
 """An estimate for a sample older than this [s] is not worth a frame: a reader that fell behind skips it."""
 STATUS_VERSION = 1
@@ -105,14 +112,19 @@ class Node:
         self._protocol = protocol
         self._motor = config.build_motor()
         self._settings = estimator_settings(config)
+        self._startup_settings = startup_settings(config) if transmit else None
         self.estimator: Estimator | None = None
         self._clipping = clipping.new_state()
+        self.startup: StartUp | None = None
+        """The start-up at standstill; None before the first sample, and where it may not ask for pulses."""
         self.meter = meter.new_state(config.injection.frequency, 1.0)
         self._last_arrival: int | None = None
         self.samples_per_frame = 1
         self.next_status = _AT_ONCE
         """When CompanionStatus is due [ns]."""
         self._next_command: int | None = None
+        self._probing_axis = 0.0
+        """Last angle [rad electrical] worth turning the probing signal to: each jump costs extra current."""
         self.position_counter = 0
         self._command_counter = 0
         status = protocol.codecs[_STATUS].index
@@ -183,7 +195,12 @@ class Node:
             estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
             frequency = min(self.config.injection.frequency, 0.5 * run.sample_rate)
             self.meter = meter.new_state(frequency, run.sample_rate)
-        estimate = estimator.process(run.values, run.gap)
+            if self._startup_settings is not None:
+                self.startup = StartUp(self._motor, estimator, self._startup_settings)
+        if self.startup is None:
+            estimate = estimator.process(run.values, run.gap)
+        else:
+            estimate = self.startup.process(run.values, run.gap, run.filled)
         if withheld.any():
             estimate.flags[withheld] &= 0xFF ^ confidence.VALID
         clipped = run.doubt & np.uint8(CLIPPED)
@@ -288,12 +305,17 @@ class Node:
 
     def quiet_ns(self, now_ns: int) -> int:
         """How long the scheduler can do without being asked [ns]: until its next command, if it has any to give."""
+        if self.startup is not None and self.startup.busy:
+            return 0  # it has to see the samples as they come
         if self.scheduler.rests:
             return _LONG_NS
         return 0 if self._next_command is None else self._next_command - now_ns
 
     def _command(self, now_ns: int) -> Command | None:
+        startup = self.startup
         period = self.config.injection.period
+        if startup is not None and startup.phase in (Phase.AXIS, Phase.PULSES):
+            period = min(period, STARTUP_PERIOD)
         if self._next_command is None:
             self._next_command = now_ns
         if self._next_command - round(1e9 * period) < now_ns < self._next_command:
@@ -301,8 +323,19 @@ class Node:
         late = max(0, now_ns - self._next_command)
         self._next_command = now_ns + round(period * 1e9) - min(late, round(0.5e9 * period))
         view = self.view
-        return self.scheduler.update(period, view.omega, view.excitation, view.theta, view.hf_current,
-                                     self._fresh(now_ns), self.running)
+        if view.flags & confidence.LOCKED:
+            self._probing_axis = view.theta
+        return self.scheduler.update(period, view.omega, view.excitation, self._probing_axis, view.hf_current,
+                                     self._fresh(now_ns), self.running,
+                                     self._pulses(),
+                                     startup is not None and startup.phase is Phase.REFUSED)
+
+    def _pulses(self) -> Command | None:
+        wanted = None if self.startup is None else self.startup.pulses
+        if wanted is None:
+            return None
+        return Command(Waveform.POLARITY_PULSES, wanted.amplitude, wanted.frequency, wanted.axis,
+                       min(self.config.injection.time_to_live, PULSES_TIME_TO_LIVE))
 
     def _fresh(self, now_ns: int) -> bool:
         return self._last_arrival is not None and now_ns - self._last_arrival <= STALE_AFTER_NS

@@ -63,7 +63,8 @@ def test_defaults() -> None:
     assert config.injection.model_dump() == {
         "enabled": True, "waveform": "rotating", "amplitude": 6.0, "frequency": 400.0, "speed_on": 40.0,
         "speed_off": 60.0, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0, "current_limit": None,
-        "time_to_live": 0.1, "period": 0.02, "axis": None,
+        "time_to_live": 0.1, "period": 0.02, "axis": None, "polarity": True,
+        "polarity_current": None, "polarity_amplitude": 30.0,
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from dataclasses import replace
 from typing import Any
@@ -402,3 +403,22 @@ def test_what_the_configuration_says_of_both() -> None:
         parse_config(m2 + 'gamma = "fast"\n')
     with pytest.raises(ValueError, match=r"observer.resistance_uncertainty is 120"):
         parse_config(m2 + "resistance_uncertainty = 120\n")
+
+
+def test_an_angle_from_outside_is_weighed_as_the_textbook_says() -> None:
+    """The information form, P^-1 + h h^T / r, with the angle's row across the measured direction."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(common.FLUX_STATES, common.FLUX_STATES)) * 0.01
+    state = common.new_state(0.0, 0.0, 0.0)
+    P = root @ root.T
+    state["P"][0], state["polarity"] = P, 1
+    state["bias"] = bias = rng.normal(size=(1, common.FLUX_STATES - 2))
+    x, theta, sigma = 0.55 * cmath.exp(0.7j), 0.75, 0.03
+    moved = riccati.take_angle(state, 0.59, x, 0.6 * cmath.exp(1j * theta), sigma)
+    h = np.zeros(common.FLUX_STATES)
+    h[:2] = -math.sin(theta), math.cos(theta)
+    after = np.linalg.inv(np.linalg.inv(P) + np.outer(h, h) / (abs(x) * sigma) ** 2)
+    step = after @ h / (abs(x) * sigma) ** 2 * -(h[0] * x.real + h[1] * x.imag)
+    np.testing.assert_allclose(state["P"][0], after, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose([moved.real, moved.imag], step[:2], rtol=1e-9)
+    np.testing.assert_allclose(state["bias"][0], bias[0] + step[2:], rtol=1e-9)

@@ -129,6 +129,7 @@ extern "C" {
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_STATE_ON_CHOICE (3u)
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_STATE_RAMP_DOWN_CHOICE (4u)
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_STATE_LIMITED_CHOICE (5u)
+#define IPMSM_CAN_COMPANION_STATUS_INJECTION_STATE_POLARITY_PULSES_CHOICE (6u)
 
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_NONE_CHOICE (0u)
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_DISABLED_BY_CONFIGURATION_CHOICE (1u)
@@ -140,6 +141,8 @@ extern "C" {
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_NO_SAMPLES_CHOICE (7u)
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_OPERATOR_CHOICE (8u)
 #define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_DRIVE_NOT_RUNNING_CHOICE (9u)
+#define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_POLARITY_UNKNOWN_CHOICE (10u)
+#define IPMSM_CAN_COMPANION_STATUS_INJECTION_REASON_POLARITY_UNKNOWABLE_CHOICE (11u)
 
 /* Frame Names. */
 #define IPMSM_CAN_DRIVE_SAMPLE_NAME "DriveSample"
@@ -981,7 +984,7 @@ struct ipmsm_can_companion_status_t {
     uint8_t injection_state;
 
     /**
-     * Why the probing signal is on, off or limited.
+     * Why the probing signal is on, off or limited. polarity_unknowable: the machine answered the polarity pulses equally both ways; at standstill nothing can tell north from south.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1

@@ -51,10 +51,13 @@ REASON_WORDS = {
     InjectionReason.NO_SAMPLES: "no samples from the drive",
     InjectionReason.DRIVE_NOT_RUNNING: "the drive does not run",
     InjectionReason.OPERATOR: "asked for by the operator",
+    InjectionReason.POLARITY_UNKNOWN: "the magnet's polarity is unknown",
+    InjectionReason.POLARITY_UNKNOWABLE: "the iron does not tell the magnet's polarity at standstill",
 }
 INJECTION_WORDS = {
     InjectionState.DISABLED: "disabled", InjectionState.OFF: "off", InjectionState.RAMP_UP: "rising",
     InjectionState.ON: "on", InjectionState.RAMP_DOWN: "falling", InjectionState.LIMITED: "limited",
+    InjectionState.POLARITY_PULSES: "polarity pulses",
 }
 
 

@@ -9,6 +9,7 @@ from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.drive.parameters import DriveNodeSettings, DriveParameters
 from ipmsm_can.estimation.estimator import EstimatorSettings
 from ipmsm_can.injection.scheduler import InjectionSettings
+from ipmsm_can.startup import StartUpSettings
 from ipmsm_can.wire.dbc import Database
 from ipmsm_can.wire.protocol import Protocol, Waveform
 
@@ -42,6 +43,14 @@ def injection_settings(config: DriveConfig) -> InjectionSettings:
                              i.speed_off, i.excitation_on, i.excitation_off, i.ramp, config.current_limit,
                              i.time_to_live, i.period,
                              None if i.axis is None else math.radians(i.axis))
+
+
+def startup_settings(config: DriveConfig) -> StartUpSettings | None:
+    """Settings of the start-up at standstill; None where it may not ask for pulses."""
+    current = config.polarity_current
+    if current is None:
+        return None
+    return StartUpSettings(config.injection.frequency, current, config.injection.polarity_amplitude)
 
 
 def drive_parameters(config: DriveConfig, fd: bool = False) -> DriveParameters:

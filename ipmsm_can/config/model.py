@@ -234,6 +234,16 @@ class InjectionConfig(Section):
             "rotating starts there, and its phase then does not follow the rotor.",
         unit=units.DEGREE, least=-180, most=180, default="along the estimated d-axis", example="0 deg")] = None
 
+    polarity: Annotated[bool, Switch(
+        doc="Whether the drive may be asked for polarity pulses at standstill, which tell the magnet's north from "
+            "its south where the iron saturates.")] = True
+    polarity_current: Annotated[float | None, Quantity(
+        doc="Largest current of the polarity pulses.", unit=units.AMPERE_PEAK, above=0,
+        default="the current that gives motor.rated_torque; where that is not given, there are no pulses",
+        example="2.3 A")] = None
+    polarity_amplitude: Annotated[float, Quantity(
+        doc="Largest voltage of the polarity pulses.", unit=units.VOLT_PEAK, above=0, most=1000)] = 30.0
+
     @model_validator(mode="after")
     def _consistent(self) -> InjectionConfig:
         if self.speed_off <= self.speed_on:
@@ -351,6 +361,16 @@ class DriveConfig(BaseModel):
         """Active flux [Wb] below which sigma(x) is 0: the given one, or psi_m / 10."""
         given = self.observer.epsilon
         return given if given is not None else self.motor.build().psi_m / 10.0
+
+    @property
+    def polarity_current(self) -> float | None:
+        """Largest current of the polarity pulses [A peak]; None: no pulses."""
+        i = self.injection
+        if not (i.enabled and i.polarity):
+            return None
+        if i.polarity_current is None and self.motor.preset is None and self.motor.rated_torque is None:
+            return None  # Motor's own default torque is no basis for a current elsewhere
+        return i.polarity_current if i.polarity_current is not None else self.motor.build().rated_current
 
     @property
     def current_limit(self) -> float:

@@ -64,6 +64,10 @@ class SimulationConfig(Section):
         least=0)] = DriveParameters.adc_step
     friction: Annotated[float, Quantity(
         doc="Viscous friction at the shaft.", unit=units.FRICTION, least=0)] = DriveParameters.friction
+    saturation: Annotated[float, Quantity(
+        doc="Share by which L_d falls when rated current flows along the positive d-axis; 0 = linear magnetics, "
+            "with which nothing can tell north from south at standstill.",
+        least=0, most=0.5)] = DriveParameters.saturation
     speed_imposed: Annotated[bool, Switch(
         doc="A load machine makes the shaft follow the profile's speed; the profile's load torque is then the "
             "drive's torque reference.")] = DriveParameters.speed_imposed

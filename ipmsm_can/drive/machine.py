@@ -2,7 +2,7 @@
 
 States are the stator flux in the stationary frame and the shaft, as in the paper (Section 2):
 
-    lambda' = v - R i,          i = L(theta_e)^-1 (lambda - psi_m c(theta_e))
+    lambda' = v - R i,          i of lambda and theta_e as in `magnetics`, linear or saturating
     J omega_m' = T - T_load - B omega_m,      theta_m' = omega_m,      theta_e = p theta_m
     T = 1.5 p (lambda_alpha i_beta - lambda_beta i_alpha)
 
@@ -20,17 +20,18 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.drive.inverter import dead_time_error
+from ipmsm_can.drive.magnetics import M_L_D as M_L_D
+from ipmsm_can.drive.magnetics import M_L_Q as M_L_Q
+from ipmsm_can.drive.magnetics import M_PSI as M_PSI
+from ipmsm_can.drive.magnetics import current_from_flux, saturation_parameters
 from ipmsm_can.motor import Motor
 
 # Machine parameters, float64 (M_SIZE,)
 M_POLE_PAIRS = 0
-M_PSI = 1
-M_L_D = 2
-M_L_Q = 3
 M_R = 4
 M_INERTIA = 5
 M_FRICTION = 6
-M_SIZE = 7
+M_SIZE = 10
 
 # Machine state, float64 (X_SIZE,): flux [Wb], speed [rad/s mechanical], angle [rad mechanical]
 X_LAMBDA_ALPHA = 0
@@ -42,9 +43,14 @@ X_SIZE = 4
 _TWO_PI = 2.0 * math.pi
 
 
-def pack_machine(motor: Motor, friction: float = 0.0) -> NDArray[np.float64]:
-    """Machine parameters as the kernels take them; friction is viscous [N m s/rad mechanical]."""
-    return np.array([motor.pole_pairs, motor.psi_m, motor.L_d, motor.L_q, motor.R, motor.J, friction])
+def pack_machine(motor: Motor, friction: float = 0.0, saturation: float = 0.0) -> NDArray[np.float64]:
+    """Machine parameters as the kernels take them.
+
+    friction: viscous [N m s/rad mechanical].  saturation: share by which L_d falls at rated positive i_d, 0..0.5;
+    raises ValueError as `magnetics.saturation_parameters`.
+    """
+    return np.array([motor.pole_pairs, motor.psi_m, motor.L_d, motor.L_q, motor.R, motor.J, friction,
+                     *saturation_parameters(motor, saturation)])
 
 
 def initial_state(motor: Motor, theta_e: float = 0.0, omega_m: float = 0.0) -> NDArray[np.float64]:
@@ -58,12 +64,6 @@ def wrap(angle: float) -> float:
     """The same angle in -pi..pi [rad]."""
     # the quotient of an angle one rounding error below pi rounds to 1: never below -pi all the same
     return max(-math.pi, angle - _TWO_PI * math.floor((angle + math.pi) / _TWO_PI))
-
-
-@kernel
-def current_from_flux(lambda_d: float, lambda_q: float, machine: NDArray[np.float64]) -> tuple[float, float]:
-    """dq current [A] of the dq stator flux [Wb], magnet included: the machine's one magnetic law."""
-    return (lambda_d - machine[M_PSI]) / machine[M_L_D], lambda_q / machine[M_L_Q]
 
 
 @kernel

@@ -39,6 +39,7 @@ class DriveParameters:
     current_offset: sensor offset (alpha, beta) [A].
     adc_step: resolution of the current samples [A], 0 for none.
     friction: viscous [N m s/rad mechanical], >= 0.
+    saturation: share by which L_d falls at rated positive d current, 0..0.5; 0: linear magnetics.
     speed_imposed: a load machine makes the rotor follow the profile's speed exactly; the drive then
         controls torque, and the profile's load torque is its torque reference.
     rotor_locked: the rotor stays where it starts; torque control as above.
@@ -70,6 +71,7 @@ class DriveParameters:
     current_offset: tuple[float, float] = (0.0, 0.0)
     adc_step: float = 0.0
     friction: float = 0.0
+    saturation: float = 0.0
     speed_imposed: bool = False
     rotor_locked: bool = False
     injection_limit: float = 30.0
@@ -102,6 +104,7 @@ class DriveParameters:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} is {value!r}; allowed is a finite number of 0 or more, in {unit}")
+        _within("saturation", self.saturation, 0.0, 0.5, "")
         if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
             raise ValueError(f"current_offset is {self.current_offset!r}; "
                              "allowed are two finite numbers, in A")
@@ -161,7 +164,7 @@ class DriveNodeSettings:
 
 def _within(name: str, value: float, low: float, high: float, unit: str) -> None:
     if not low <= value <= high:
-        raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g} {unit}")
+        raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g} {unit}".rstrip())
 
 
 def torque_at_current(motor: Motor, current: float, mtpa: bool) -> float:

@@ -92,7 +92,8 @@ class DriveSamples:
     theta_e: true rotor angle at t_k [rad electrical], -pi..pi.  omega_e: true speed [rad/s electrical].
     i_d, i_q: true current [A].  torque: air-gap torque [N m].
     load_torque: the profile's load torque [N m] (the torque reference with an imposed or locked rotor).
-    active_flux: psi_m + L_0 i_d [Wb], length of the paper's x, which points along theta_e.
+    active_flux: lambda_d - L_q i_d [Wb], without saturation psi_m + L_0 i_d, the length of the paper's x,
+        which points along theta_e.
     v_inj_alpha, v_inj_beta: probing part of the voltage [V], as it was before the voltage limit.
     speed_reference: the profile's speed [rad/s mechanical].
     injection_waveform, injection_amplitude: probing waveform (0..3) and its amplitude [V peak] as decided
@@ -246,7 +247,7 @@ class DriveSimulation:
         self.profile = profile
         p = parameters
         period = 1.0 / p.sample_rate
-        self._machine = machine.pack_machine(motor, p.friction)
+        self._machine = machine.pack_machine(motor, p.friction, p.saturation)
         self._control = control.pack_control(motor, period, p.current_bandwidth, p.speed_bandwidth,
                                              p.torque_max(motor), p.v_max, p.mtpa)
         self._drive = np.array([

@@ -33,7 +33,8 @@ That is the theory of `ges`; of the other observers it describes
                           Added here is whether the speed is plausible: |Phi| against that of a rotor that turns as
                           fast as the angle does
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
-                          is added.  They see an axis, not its north: polarity is never known, no angle valid.
+                          is added.  They see an axis, not its north: polarity is not known unless `take_angle`
+                          has told them; and none of their angles is valid, for a single window may be far off
 """
 
 from __future__ import annotations
@@ -130,6 +131,35 @@ def widen(state: NDArray[np.void], flux_variance: float) -> None:
     state["p_bb"] += flux_variance
 
 
+def take_angle(state: NDArray[np.void], x_hat: complex, measured: complex, sigma: float) -> complex:
+    """Take in an active flux measured by its direction, polarity known: returns what x_hat has to be put right by.
+
+    x_hat, measured [Wb]; sigma: 1-sigma of the direction [rad electrical].  Where polarity was unknown, x_hat
+    becomes what was measured, else it is corrected across that by the Kalman gain of its covariance.
+    """
+    st = state[0]
+    north = measured / abs(measured)
+    psi_m = float(st["psi_m"])
+    if not st["polarity"]:
+        across2, along2 = (psi_m * sigma) ** 2, (MODEL_ERROR * psi_m) ** 2
+        st["p_aa"] = along2 * north.real**2 + across2 * north.imag**2
+        st["p_bb"] = along2 * north.imag**2 + across2 * north.real**2
+        st["p_ab"] = (along2 - across2) * north.real * north.imag
+        st["started"], st["polarity"], st["test"] = 1, 1, 1.0
+        return measured - x_hat
+    off = (north * x_hat.conjugate()).imag  # how far x_hat would have to move across the measured direction
+    e_a, e_b = -north.imag, north.real
+    pe_a = float(st["p_aa"] * e_a + st["p_ab"] * e_b)
+    pe_b = float(st["p_ab"] * e_a + st["p_bb"] * e_b)
+    expected = e_a * pe_a + e_b * pe_b + (abs(x_hat) * sigma) ** 2
+    if not expected > 0.0:
+        return 0j
+    st["p_aa"] -= pe_a * pe_a / expected
+    st["p_ab"] -= pe_a * pe_b / expected
+    st["p_bb"] -= pe_b * pe_b / expected
+    return complex(pe_a, pe_b) * off / expected
+
+
 @kernel
 def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Floats,
                 flags: NDArray[np.uint8]) -> None:
@@ -140,6 +170,7 @@ def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Flo
     st = state[0]
     smoothing = 1.0 - math.exp(-st.T_s / INNOVATION_TIME)
     locked = st.locked
+    polarity = st.polarity
     test = st.test if st.started else _UNKNOWN_AXIS**2
     st.started = 1
     for k in range(flux.shape[1]):
@@ -155,10 +186,13 @@ def _axis_block(flux: Floats, speed: Floats, state: NDArray[np.void], sigma: Flo
         if not s < math.pi:
             s = math.pi
         locked = 1 if s < (_SIGMA_HYSTERESIS if locked else 1.0) * st.sigma_limit else 0
+        if s > _POLARITY_SIGMA:
+            polarity = 0  # the rotor may have turned over meanwhile
         sigma[k] = s
-        flags[k] = LOCKED * locked
+        flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity
     st.test = test
     st.locked = locked
+    st.polarity = polarity
 
 
 @kernel

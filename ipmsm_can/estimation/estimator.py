@@ -15,7 +15,7 @@ from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
 from ipmsm_can.estimation.observers import common, riccati
 from ipmsm_can.estimation.observers.dispatch import observer_block
-from ipmsm_can.estimation.observers.kinds import KINDS, RICCATI
+from ipmsm_can.estimation.observers.kinds import KINDS, MODULO_PI, RICCATI
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
 from ipmsm_can.estimation.regression import regression_block
 from ipmsm_can.estimation.speed import speed_block
@@ -176,6 +176,36 @@ class Estimator:
             out.sigma[span] = part.sigma
             out.flags[span] = part.flags
         return out
+
+    def take_angle(self, theta: float, sigma: float) -> None:
+        """Take in an angle of known polarity for the last sample, while the rotor stands still.
+
+        theta, sigma: angle and its 1-sigma [rad electrical].  An observer of flux is corrected by its covariance,
+        or set where its polarity was unknown; one of the kinds in MODULO_PI is put on the branch of theta.
+        """
+        o, c, r, pll = self._observer[0], self._confidence[0], self._regression[0], self._speed[0]
+        kind = KINDS[self.settings.kind]
+        if kind in MODULO_PI:
+            own = float(o["theta"]) if o["known"] else theta
+            o["theta"], o["known"] = own + math.pi * round((theta - own) / math.pi), 1
+            c["polarity"] = 1
+            return
+        unknown = not (o if kind == RICCATI else c)["polarity"]
+        i = complex(r["i_a"], r["i_b"])
+        x = complex(o["lambda_a"], o["lambda_b"]) - self._assumed.L_q * i
+        north = complex(math.cos(theta), math.sin(theta))
+        measured = (self._assumed.psi_m + self._assumed.L_0 * (i * north.conjugate()).real) * north
+        if kind == RICCATI:
+            x += riccati.take_angle(self._observer, self._assumed.psi_m, x, measured, sigma)
+        else:
+            x += confidence.take_angle(self._confidence, x, measured, sigma)
+        flux = x + self._assumed.L_q * i
+        o["lambda_a"], o["lambda_b"], o["x_a"], o["x_b"] = flux.real, flux.imag, x.real, x.imag
+        if unknown:
+            o["kick_a"] = o["kick_b"] = 0.0
+            pll["theta"] = pll["theta_hat"] = o["pll_theta"] = o["pll_hat"] = math.atan2(x.imag, x.real)
+            pll["omega"] = pll["omega_difference"] = o["pll_omega"] = o["pll_difference"] = 0.0
+        common.stand_still(self._observer, i, complex(r["fi_a"], r["fi_b"]), x, self.settings.epsilon)
 
     def _segment(self, samples: Floats, out: EstimateBlock) -> None:
         estimate_block(samples, self._regression_parameters, self._regression, self._observer_parameters,

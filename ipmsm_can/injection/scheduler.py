@@ -15,6 +15,8 @@ from ipmsm_can.wire.protocol import InjectionReason, InjectionState, Waveform
 
 OFF_REPEATS = 3
 """How often "off" is said after injection ended, so that one lost frame does not matter."""
+SETTLING = 0.06
+"""How long after polarity pulses the measured current is not that of the waveform [s]."""
 _RECOVERY = 0.1
 """Share of the way back to full amplitude per second once the current is below its limit again."""
 
@@ -66,6 +68,7 @@ class InjectionScheduler:
         self._wanted = False
         self._share = 1.0
         self._off_left = 0
+        self._settling = 0.0
         self._operator: bool | None = None
         self.state = InjectionState.OFF
         self.reason = InjectionReason.NONE
@@ -99,17 +102,30 @@ class InjectionScheduler:
         return s.speed_on, s.excitation_on
 
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
-               fresh: bool, running: bool = True) -> Command | None:
+               fresh: bool, running: bool = True, pulses: Command | None = None,
+               unknowable: bool = False) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.
 
         elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
         electrical] of the estimate.  current: measured high-frequency current [A peak].  fresh: samples
         are coming in.  running: the inverter applies the voltage it reports, as far as is known.
+        pulses: polarity pulses, asked for instead of the waveform where that may be injected.  unknowable: the
+        polarity was asked for in vain.
         """
         s = self.settings
         if self.state is InjectionState.DISABLED:
             return None
         reason = self._decide(abs(omega), excitation, fresh, running)
+        if pulses is not None and self._wanted:
+            self._off_left = OFF_REPEATS
+            self._settling = SETTLING
+            self._enter(InjectionState.POLARITY_PULSES, InjectionReason.POLARITY_UNKNOWN)
+            return pulses
+        if unknowable and reason is InjectionReason.LOW_SPEED:
+            reason = InjectionReason.POLARITY_UNKNOWABLE
+        if self._settling > 0.0:
+            self._settling -= elapsed
+            current = 0.0  # what is measured now may still be the pulses'
         target = s.amplitude * self._limit(current, elapsed) if self._wanted else 0.0
         step = s.ramp * elapsed
         before = self.amplitude
@@ -175,6 +191,7 @@ class InjectionScheduler:
             state = InjectionState.RAMP_UP
         else:
             state = InjectionState.ON
-        if state is not InjectionState.LIMITED and reason is InjectionReason.CURRENT_LIMIT:
+        if state is not InjectionState.LIMITED and reason in (InjectionReason.CURRENT_LIMIT,
+                                                              InjectionReason.POLARITY_UNKNOWN):
             reason = InjectionReason.LOW_SPEED
         self._enter(state, reason)

@@ -150,7 +150,7 @@ class Recorder:
             rows = np.flatnonzero(labels == MessageKind.INJECTION_COMMAND * NODES + self._node)
             values, _, _ = self._protocol.decode(MessageKind.INJECTION_COMMAND, self._node, frames.raw, rows)
             latest = int(self._counter[self.samples - 1])
-            self._commands.append((latest, float(values[self._amplitude_row, -1])))
+            self._commands += [(latest, amplitude) for amplitude in values[self._amplitude_row].tolist()]
 
     def _note_error(self, reference: Floats) -> None:
         back = int(self._counter[self.samples - 1]) - int(reference[2]) if self.samples else -1

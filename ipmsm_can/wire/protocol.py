@@ -104,6 +104,7 @@ class InjectionState(IntEnum):
     ON = 3
     RAMP_DOWN = 4
     LIMITED = 5
+    POLARITY_PULSES = 6
 
 
 class InjectionReason(IntEnum):
@@ -119,6 +120,8 @@ class InjectionReason(IntEnum):
     NO_SAMPLES = 7
     OPERATOR = 8
     DRIVE_NOT_RUNNING = 9
+    POLARITY_UNKNOWN = 10
+    POLARITY_UNKNOWABLE = 11
 
 
 # Every signal the program reads or writes, with its width where a counter's modulus or a flag depends on it.

@@ -144,6 +144,23 @@ def new_state(lambda_a: float, lambda_b: float, theta: float) -> NDArray[np.void
     return state
 
 
+def stand_still(state: NDArray[np.void], i: complex, filtered: complex, x: complex, epsilon: float) -> None:
+    """Give the filters of d the past of a rotor that has always stood at the angle of x [Wb].
+
+    i, filtered: current [A peak] and F[i] as the regression has it.  For a fixed direction c the filters take
+    F[i^T c] = F[i]^T c, and the same for the gradient of i^T sigma(x).
+    """
+    o = state[0]
+    size = abs(x)
+    direction = x / size if size > epsilon else 0j
+    across = direction * 1j / size if size > epsilon else 0j
+    o["s"] = (i * direction.conjugate()).real
+    o["f_s"] = (filtered * direction.conjugate()).real
+    u = (i * direction.conjugate()).imag * across
+    f_u = (filtered * direction.conjugate()).imag * across
+    o["u_a"], o["u_b"], o["f_u_a"], o["f_u_b"] = u.real, u.imag, f_u.real, f_u.imag
+
+
 @kernel
 def along(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) -> float:
     """i^T sigma(x): the current along the estimated rotor axis [A peak], 0 where |x| < epsilon."""

@@ -79,6 +79,31 @@ def carry_over(old: NDArray[np.void], fresh: NDArray[np.void], turned: float, va
         fresh[name] = old[name]
 
 
+def take_angle(state: NDArray[np.void], psi_m: float, x_hat: complex, measured: complex, sigma: float) -> complex:
+    """Take in an active flux measured by its direction, polarity known: as `confidence.take_angle`.
+
+    state: record array (1,) of `common.STATE`; psi_m, x_hat, measured [Wb]; sigma: 1-sigma of the direction [rad
+    electrical].  Returns what x_hat has to be put right by [Wb].
+    """
+    st = state[0]
+    P = st["P"]
+    north = measured / abs(measured)
+    if not st["polarity"]:
+        across2, along2 = (psi_m * sigma) ** 2, (MODEL_ERROR * psi_m) ** 2
+        P[:2, :] = P[:, :2] = 0.0
+        P[0, 0] = along2 * north.real**2 + across2 * north.imag**2
+        P[1, 1] = along2 * north.imag**2 + across2 * north.real**2
+        P[0, 1] = P[1, 0] = (along2 - across2) * north.real * north.imag
+        st["polarity"], st["test"] = 1, 1.0
+        return measured - x_hat
+    row, gain = np.zeros(FLUX_STATES), np.zeros(FLUX_STATES)
+    row[:2] = -north.imag, north.real
+    off = (north * x_hat.conjugate()).imag  # how far x_hat would have to move across the measured direction
+    _correct(P, row, gain, (abs(x_hat) * sigma) ** 2 + 1e-24 * psi_m * psi_m)
+    st["bias"] += gain[2:] * off
+    return complex(gain[0], gain[1]) * off
+
+
 @kernel
 def _forget(P: Floats, st: Any, p: Any, ceiling: float) -> None:
     """Nothing is known any more but the priors."""
