@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from ipmsm_can.estimation import confidence, polarity
 from ipmsm_can.estimation.estimator import FORGET_AFTER, EstimateBlock, Estimator
+from ipmsm_can.estimation.observers.riccati import TILT
 from ipmsm_can.estimation.polarity import Verdict, window_block
 from ipmsm_can.motor import Motor
 
@@ -47,6 +48,7 @@ _DRIFT_SIGMA = math.radians(1.0)
 _JUMP = math.radians(30.0)
 _AXIS_WINDOWS = 3
 _COHERENT = 0.9
+_LEAST_LINE = 3
 _PULSES_S = 0.4
 _PAUSE_S = 1.0
 _TRIES = 3
@@ -115,6 +117,7 @@ class StartUp:
         self._lost = 0
         self._last_flags = 0
         self._last_peak = 0.0
+        self._turning = _Turning()
         self._begin_axis()
 
     @property
@@ -183,7 +186,8 @@ class StartUp:
                 self._to(Phase.AXIS)
             return
         theta, sigma = polarity.axis(self._window, self._noise)
-        sigma = math.hypot(sigma, _MODEL_SIGMA, self._turned / max(float(self._window["voltage"][0]), 1e-9))
+        tilt = TILT * (polarity.load(self._window) / self._motor.rated_current) ** 2
+        sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, self._turned / max(float(self._window["voltage"][0]), 1e-9))
         if not self._window["broken"][0]:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)
         still = abs(self._back_emf) < self._still_below
@@ -196,6 +200,7 @@ class StartUp:
                 self._begin_axis()
         elif self.phase is Phase.PULSES:
             self._track(theta, sigma)
+            self._turning.add(self.angle, theta, sigma)
             self._judge_pulses(still)
             self._look_along(self.angle)  # the pulses show the axis much better than what went before
         else:
@@ -242,8 +247,12 @@ class StartUp:
         if verdict is Verdict.EQUAL:
             self._to(Phase.REFUSED)
         elif verdict is not Verdict.OPEN:
+            angle, sigma = self._turning.now
+            if not sigma < _AXIS_SIGMA:
+                return  # of which end is north there is no doubt, but where it is now nobody knows yet
             if verdict is Verdict.SOUTH:
-                self.angle = math.remainder(self.angle + math.pi, 2.0 * math.pi)
+                angle += math.pi
+            self.angle, self.sigma = math.remainder(angle, 2.0 * math.pi), sigma
             self._to(Phase.KNOWN)
             self.estimator.take_angle(self.angle, self.sigma)
 
@@ -282,6 +291,7 @@ class StartUp:
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
             self._last_peak = 0.0
             self._windows_left = round(_PULSES_S * self._rate / self.n)
+            self._turning = _Turning()
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0
 
@@ -291,6 +301,49 @@ class StartUp:
 
     def _begin_axis(self) -> None:
         self._axis_windows, self._axis_weight, self._axis_sum = 0, 0.0, 0j
+
+
+class _Turning:
+    """A straight line through the axes of successive windows: a rotor that turns too slowly for its back-EMF to
+    show moves by tens of degrees while it is looked at."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._sums = np.zeros((2, 2))
+        self._right = np.zeros(2)
+        self._square = self._weight = self._common2 = 0.0
+        self._last = 0.0
+
+    def add(self, near: float, theta: float, sigma: float) -> None:
+        """Take in a window's axis, modulo pi, on the branch next to `near`."""
+        self._n += 1
+        if not math.isfinite(sigma):
+            return
+        if not self._weight:
+            self._last = near
+        angle = self._last + math.remainder(theta - self._last, math.pi)
+        self._last = angle
+        row = np.array([1.0, self._n])
+        self._sums += np.outer(row, row) / sigma**2
+        self._right += row * angle / sigma**2
+        self._square += angle**2 / sigma**2
+        self._weight += 1.0
+        self._common2 = max(self._common2, sigma**2) if self._common2 else sigma**2
+
+    @property
+    def now(self) -> tuple[float, float]:
+        """Angle at the end of the last window and its 1-sigma [rad electrical]: inf with fewer than three windows.
+
+        What the windows are wrong by besides noise they have in common, so the 1-sigma of the worst of them stands
+        beside that of the line.
+        """
+        if self._weight < _LEAST_LINE:
+            return 0.0, math.inf
+        inverse = np.linalg.inv(self._sums)
+        fit = inverse @ self._right
+        scatter = max((self._square - float(self._right @ fit)) / (self._weight - 2.0), 1.0)
+        row = np.array([1.0, self._n + 0.5])
+        return float(row @ fit), math.sqrt(scatter * float(row @ inverse @ row) + self._common2)
 
 
 def pulse_period(motor: Motor, settings: StartUpSettings, sample_rate: float) -> int:

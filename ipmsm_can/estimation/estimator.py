@@ -28,6 +28,8 @@ FORGET_AFTER = 0.5
 """A gap in the samples longer than this [s] starts everything anew."""
 _SPEED_DOUBT = 0.1
 """How wrong the extrapolation over a gap may be, relative to the angle turned meanwhile."""
+_TORQUE_DOUBT = 0.25
+"""1-sigma of the torque on the shaft that nobody saw change in a gap, as a share of the rated torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +198,8 @@ class Estimator:
         north = complex(math.cos(theta), math.sin(theta))
         measured = (self._assumed.psi_m + self._assumed.L_0 * (i * north.conjugate()).real) * north
         if kind == RICCATI:
-            x += riccati.take_angle(self._observer, self._assumed.psi_m, x, measured, sigma)
+            x += riccati.take_angle(self._observer, self._assumed.psi_m, self._observer_parameters[0]["prior"], x,
+                                    measured, sigma)
         else:
             x += confidence.take_angle(self._confidence, x, measured, sigma)
         flux = x + self._assumed.L_q * i
@@ -228,11 +231,16 @@ class Estimator:
             pll = self._speed
             turned = float(pll["omega"][0]) * elapsed
             angle = float(pll["theta"][0]) + turned
+            # The acceleration may have ended in the gap, or begun: a load step is not announced.
+            bent = 0.0
             one_step_back, lag = angle - float(pll["omega"][0]) / self.sample_rate, 0.0
             own = KINDS[s.kind] == RICCATI
             if own and self._confidence["locked"][0]:
                 speed_before = float(pll["omega"][0])
                 angle, omega, lag = speed.carried(pll, elapsed)
+                accelerated = (omega - speed.carried(pll, 0.0)[1]) / elapsed
+                unseen = _TORQUE_DOUBT * self.motor.pole_pairs * self.motor.rated_torque / self.motor.J
+                bent = 0.5 * math.hypot(accelerated, unseen) * elapsed**2
                 turned = angle - float(pll["theta_hat"][0])
                 one_step_back = angle - omega / self.sample_rate
                 # The loop goes on with the lag that it had.
@@ -250,7 +258,7 @@ class Estimator:
                 # What was taken for one stretch of time was two, or the other way round.
                 doubt = size * min(abs(missing * float(pll["omega"][0])) / self.sample_rate, math.pi)
             else:
-                doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
+                doubt = size * min(math.hypot(_SPEED_DOUBT * turned, bent), math.pi)
             drift = s.voltage_uncertainty * elapsed
             confidence.widen(self._confidence, doubt**2 + drift**2)
             for name in ("pll_started", "pll_omega", "pll_difference"):

@@ -35,6 +35,9 @@ RESIDUAL_SHARE = 0.1
 """What none of the four describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
 _KEEPS = (10.0, 10.0, 10.0, 30.0)
 """Time constants [s]: temperature moves all of them."""
+CORNER_SHARE = 0.15
+"""Phase current, as a share of the rated current, up to which the shape of dead time is uncertain: the output
+capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it."""
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 
 
@@ -72,6 +75,11 @@ class Uncertainty:
         return max(4.0 * self.current, 0.02 * motor.rated_current)
 
 
+def corner(motor: Motor) -> float:
+    """Phase current [A] up to which the shape of dead time is uncertain."""
+    return CORNER_SHARE * motor.rated_current
+
+
 def keeps(sample_rate: float) -> tuple[float, ...]:
     """Factors by which the states fall back to zero in one sample."""
     return tuple(math.exp(-1.0 / (sample_rate * t)) for t in _KEEPS)
@@ -92,6 +100,19 @@ def directions(i_a: float, i_b: float, zone: float, B: NDArray[np.float64]) -> N
     B[2, 1] = -(phase_b - phase_c) * _HALF_SQRT3 / 1.5
     B[3, 0] = -i_a
     B[3, 1] = -i_b
+
+
+@kernel
+def near_zero(i_a: float, i_b: float, corner: float) -> float:
+    """Square of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
+
+    A phase's share falls from 1 at zero current to 0 at `corner` [A]; the phases' errors are independent.
+    """
+    total = 0.0
+    for phase in (i_a, -0.5 * i_a + _HALF_SQRT3 * i_b, -0.5 * i_a - _HALF_SQRT3 * i_b):
+        share = max(0.0, 1.0 - abs(phase) / corner)
+        total += share * share
+    return 4.0 / 9.0 * total
 
 
 @kernel
