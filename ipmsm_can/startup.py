@@ -311,7 +311,8 @@ class _Turning:
         self._n = 0
         self._sums = np.zeros((2, 2))
         self._right = np.zeros(2)
-        self._square = self._weight = self._common2 = 0.0
+        self._square = self._weight = 0.0
+        self._common2 = math.inf
         self._last = 0.0
 
     def add(self, near: float, theta: float, sigma: float) -> None:
@@ -328,13 +329,13 @@ class _Turning:
         self._right += row * angle / sigma**2
         self._square += angle**2 / sigma**2
         self._weight += 1.0
-        self._common2 = max(self._common2, sigma**2) if self._common2 else sigma**2
+        self._common2 = min(self._common2, sigma**2)
 
     @property
     def now(self) -> tuple[float, float]:
         """Angle at the end of the last window and its 1-sigma [rad electrical]: inf with fewer than three windows.
 
-        What the windows are wrong by besides noise they have in common, so the 1-sigma of the worst of them stands
+        What the windows are wrong by besides noise they have in common, so the 1-sigma of the best of them stands
         beside that of the line.
         """
         if self._weight < _LEAST_LINE:

@@ -2,7 +2,8 @@
 
 Every run is a function of (seed, number, kind) alone, so it does not matter where or in which order the runs are
 done.  The file of records is JSON Lines: a first line that says which campaign it is, then a line a run.  A
-campaign that was killed is continued from it; at most the line that was being written is lost, and that run done again.
+campaign that was killed is continued from it; at most the line that was being written is lost, and that run done
+again.
 """
 
 from __future__ import annotations

@@ -36,10 +36,10 @@ def build(summary: Record, records: Sequence[Record], command: str) -> str:
     title = "Valid, and sometimes wrong" if wrong else "Valid, and never wrong"
     head = (f"<h1>{title}: {runs} random runs</h1>"
             '<p class="lead">Random motors, motor data, sensors, loads, speed profiles, losses and starts, through '
-            f"the simulated drive, its frames and the companion with the observer <b>{escape(plan['kind'])}</b>; seed "
-            f"{plan['seed']}. Angles are electrical.</p><p><b>{tally}</b> {told}The angle was valid for "
+            f"the simulated drive, its frames and the companion with the observer <b>{escape(plan['kind'])}</b>; "
+            f"seed {plan['seed']}. Angles are electrical.</p><p><b>{tally}</b> {told}The angle was valid for "
             f"{summary['seconds_valid']:.0f} s, {summary['estimates_valid']} of {summary['estimates']} estimates; "
-            f"in {summary['never_valid']} runs it never was.</p>{_troubles(summary)}")
+            f"in {summary['never_valid']} runs it never was.</p>{_by_limit(summary)}{_troubles(summary)}")
     plots = [p for p in (
         _pooled(summary), _ratio(summary),
         _over_runs("Largest error while valid, run by run", "largest error, ° electrical", "share of the runs",
@@ -71,6 +71,11 @@ def _drawing(plot: Plot, name: str) -> str:
 
 def _share(value: float) -> str:
     return f"{100.0 * value:.2f} %"
+
+
+def _by_limit(summary: Record) -> str:
+    parts = "; ".join(f"{limit}°: {n['wrong']} of {n['runs']}" for limit, n in summary["by_valid_sigma"].items())
+    return f'<p class="note">Runs wrong, by the largest 1-sigma that was allowed to be valid: {parts}.</p>'
 
 
 def _troubles(summary: Record) -> str:
@@ -107,7 +112,8 @@ def _ratio(summary: Record) -> Plot | None:
     normal = np.array([100.0 * math.erf(v / math.sqrt(2.0)) for v in x])
     return Plot("Does the 1-sigma tell the truth?", "error over 1-sigma", "% of the valid time",
                 (Curve(x, normal, "truth", "as a normal distribution has it"),
-                 Curve(x[:-1], y[:-1], "c0", "measured"), _upright(2.0, 0.0, 100.0)), x=(0.01, 10.0), y=(0.0, 100.0), log_x=True)
+                 Curve(x[:-1], y[:-1], "c0", "measured"), _upright(2.0, 0.0, 100.0)),
+                x=(0.01, 10.0), y=(0.0, 100.0), log_x=True)
 
 
 def _over_runs(title: str, x_label: str, y_label: str, parts: list[tuple[Floats, str, str]],
@@ -177,7 +183,8 @@ def _worst(summary: Record) -> str:
     return (f'<section><h3>The worst runs</h3><p class="note">Each is drawn from the seed {plan["seed"]} and its '
             f"number alone. To repeat one, with its course over time: {escape(repeat)}</p>"
             '<div class="scroll"><table><thead><tr><th>run</th><th>motor, shaft</th>'
-            '<th class="n">largest error [°]</th><th class="n">rms [°]</th><th class="n">1-sigma [°]</th><th class="n">wrong from [s]</th>'
+            '<th class="n">largest error [°]</th><th class="n">rms [°]</th>'
+            '<th class="n">1-sigma [°]</th><th class="n">wrong from [s]</th>'
             '<th class="n">longest [ms]</th></tr></thead>'
             f"<tbody>{''.join(rows)}</tbody></table></div></section>")
 

@@ -27,6 +27,9 @@ SPEED_RPM = (5.0, 1000.0)
 """Speeds other than zero, log-uniform [rpm mechanical]."""
 ACCELERATION = (5.0, 600.0)
 """Of ramps, log-uniform [rad/s^2 mechanical]; the drive can do 930 at J = 0.01 kg m^2."""
+LOOP_SHARE = 25.0
+"""Sample rate over bandwidth of the current loops: they stay stable when the inductance falls with saturation."""
+SPEED_LOOP = 15.0
 CURRENT_OFFSET = 0.02
 CURRENT_NOISE = (0.005, 0.03)
 DEAD_TIME = 1.0
@@ -103,7 +106,8 @@ class Scenario:
     def parameters(self) -> DriveParameters:
         """The simulated drive's settings."""
         return DriveParameters(
-            sample_rate=self.sample_rate, mtpa=self.mtpa, dead_time_voltage=self.dead_time,
+            sample_rate=self.sample_rate, current_bandwidth=self.sample_rate / LOOP_SHARE,
+            speed_bandwidth=SPEED_LOOP, mtpa=self.mtpa, dead_time_voltage=self.dead_time,
             dead_time_zone=self.dead_zone, current_noise=self.current_noise,
             current_offset=(self.offset_alpha, self.offset_beta), adc_step=self.adc_step,
             saturation=self.saturation, speed_imposed=self.shaft == "imposed", rotor_locked=self.shaft == "locked",
@@ -173,7 +177,7 @@ def draw(seed: int, number: int, kind: str = "riccati") -> Scenario:
         frequency=float(rng.choice([200.0, 250.0, 400.0, 500.0])),
         injection_limit=3.0 if rng.random() < 0.1 else 30.0,
         current_limit=float(rng.uniform(0.1, 0.2)) * machine.rated_current,
-        valid_sigma=float(rng.choice([10.0, 5.0, 3.0], p=[0.8, 0.1, 0.1])),
+        valid_sigma=float(rng.choice([10.0, 5.0, 3.0], p=[0.5, 0.35, 0.15])),
         initial_alpha=float(np.real(flux)), initial_beta=float(np.imag(flux)),
         noise_seed=int(rng.integers(1 << 31)), bus_seed=int(rng.integers(1 << 31)))
 

@@ -62,7 +62,8 @@ class MotorConfig(Section):
         doc="Stator resistance per phase, at working temperature.",
         unit=units.OHM, least=0, most=1000, default=_FROM_PRESET, example="1.059 ohm")] = None
     J: Annotated[float | None, Quantity(
-        doc="Inertia at the shaft, used by the simulated drive only.", unit=units.INERTIA, above=0, most=1e6,
+        doc="Inertia at the shaft, for the simulated drive, and for how far a rotor may turn while "
+            "samples are missing.", unit=units.INERTIA, above=0, most=1e6,
         default=f"{_FROM_PRESET}, or {Motor.__dataclass_fields__['J'].default}",
         example="100 kg cm^2")] = None
     rated_torque: Annotated[float | None, Quantity(
@@ -101,7 +102,8 @@ class WireConfig(Section):
         doc="Samples per second, used until the drive sends DriveTiming, or if it never does.",
         unit=units.HERTZ, least=100, most=100e3, default="wait for DriveTiming", example="10 kHz")] = None
     max_gap: Annotated[int, Quantity(
-        doc="Longest run of lost samples that is filled by interpolation; a longer one restarts the filters.",
+        doc="Longest run of lost samples that is filled by interpolation; a longer one, or one of more than "
+            "1.7 ms, restarts the filters.",
         unit=units.SAMPLES, whole=True, least=0, most=64)] = 8
     bitrate: Annotated[int, Quantity(
         doc="Nominal bit rate, for the bus load.",
@@ -187,7 +189,8 @@ class EstimateConfig(Section):
     status_rate: Annotated[float, Quantity(
         doc="CompanionStatus messages per second.", unit=units.HERTZ, least=1, most=1e3)] = 10.0
     valid_sigma: Annotated[float, Quantity(
-        doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical).",
+        doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical). An error "
+            "of three of them is rare: 5 deg stands for 15 deg at most.",
         unit=units.DEGREE, above=0, most=90)] = 10.0
 
 
