@@ -49,7 +49,7 @@ class Estimate:
     valid: NDArray[np.bool_]
 
 
-def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str, observer: str = "ges",
+def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str, observer: str | None = None,
              valid_sigma: float | None = None, injection_frequency: float | str | None = None,
              **gains: Any) -> Estimate:
     """Estimate rotor position from sampled currents and voltages.
@@ -57,11 +57,13 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
     i: stator current at the sample instants [A peak], alpha-beta, shape (N, 2) or complex (N,).
     v: MEAN stator voltage over the interval that ended at each sample [V peak], same shape.
     sample_rate [Hz], 100..100000.  motor: a Motor, or the name of a preset ("m1", "m2").
-    observer: its kind, see [observer] in drive.toml and docs/estimation.md.
+    observer: its kind, see [observer] in drive.toml and docs/estimation.md; None for the default, riccati, or ges
+    where gamma is given.
     valid_sigma: largest 1-sigma of a valid angle [deg electrical].
     injection_frequency: of the probing signal [Hz], for the kinds injection_extraction and injection_demodulation.
     gains: the other keys of [observer] in drive.toml: alpha, gamma, initial_flux, epsilon,
-    excitation_window, speed_bandwidth, voltage_uncertainty, current_noise; numbers in SI or strings with units.
+    excitation_window, speed_bandwidth, voltage_uncertainty, current_noise, voltage_delay; numbers in SI or strings
+    with units.
 
     Raises ValueError with one sentence for shapes that do not fit, values that are not finite, an unknown
     motor, or a gain outside its range.
@@ -80,7 +82,7 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
     config = config_from({
         "motor": {name: getattr(motor, name) for name in ("pole_pairs", "psi_m", "L_d", "L_q", "R", "J",
                                                           "rated_torque")},
-        "observer": {"kind": observer, **gains},
+        "observer": {**({} if observer is None else {"kind": observer}), **gains},
         "estimate": {} if valid_sigma is None else {"valid_sigma": valid_sigma},
         "injection": {} if injection_frequency is None else {"frequency": injection_frequency},
         # The sample rate only matters for what the injection may be; other kinds do not look at that.

@@ -138,11 +138,8 @@ class StartUp:
 
     def process(self, samples: Floats, gap: NDArray[np.int64], filled: NDArray[np.uint8]) -> EstimateBlock:
         """Run the estimator over a block, as `Estimator.process`, and the start-up with it."""
-        if not self.possible or self.phase is Phase.REFUSED:
-            out = self.estimator.process(samples, gap)
-            if gap.max() > FORGET_AFTER * self._rate:
-                self._to(Phase.WATCH)
-            return out
+        if not self.possible:
+            return self.estimator.process(samples, gap)
         n = samples.shape[1]
         breaks = set(np.flatnonzero(gap).tolist())
         parts = []
@@ -150,16 +147,20 @@ class StartUp:
         while begin < n:
             if begin in breaks:
                 self._interrupt(int(gap[begin]))
-            end = min([n, begin + self.n - self._count, *(k for k in breaks if k > begin)])
+            end = min([n, *(k for k in breaks if k > begin)])
+            if self.phase is not Phase.REFUSED:
+                end = min(end, begin + self.n - self._count)
             part = np.ascontiguousarray(samples[:, begin:end])
             parts.append(self.estimator.process(part, gap[begin:end]))
+            begin, start = end, begin
+            if self.phase is Phase.REFUSED:
+                continue
             if self.phase is not Phase.WATCH:
-                window_block(part, filled[begin:end], self._window)
-            self._count += end - begin
+                window_block(part, filled[start:end], self._window)
+            self._count += end - start
             if self._count == self.n:
                 self._judge(int(parts[-1].flags[-1]), float(parts[-1].sigma[-1]))
                 self._begin_window()
-            begin = end
         return parts[0] if len(parts) == 1 else _joined(parts)
 
     def _begin_window(self) -> None:
@@ -169,7 +170,7 @@ class StartUp:
     def _interrupt(self, missing: int) -> None:
         """Samples are missing: what was gathered so far does not go on behind the gap."""
         self._begin_window()
-        if missing > FORGET_AFTER * self._rate or missing < 0:
+        if missing > FORGET_AFTER * self._rate or (missing < 0 and self.phase is not Phase.REFUSED):
             self._to(Phase.WATCH)
         elif self.phase in (Phase.AXIS, Phase.PULSES):
             self._to(Phase.AXIS)

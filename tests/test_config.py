@@ -52,10 +52,10 @@ def test_defaults() -> None:
         "data_bitrate": 5_000_000,
     }
     assert config.observer.model_dump() == {
-        "kind": "ges", "alpha": None, "gamma": None, "initial_flux": (0.0, 0.0), "epsilon": None,
+        "kind": "riccati", "alpha": None, "gamma": None, "initial_flux": (0.0, 0.0), "epsilon": None,
         "excitation_window": 0.1, "speed_bandwidth": 20.0, "voltage_uncertainty": 0.5, "current_noise": 0.02,
         "resistance_uncertainty": 12.0, "inductance_uncertainty": 6.0, "adapt_voltage": True,
-        "adapt_resistance": True,
+        "adapt_resistance": True, "voltage_delay": "auto",
     }
     assert config.estimate.model_dump() == {
         "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 10.0,
@@ -69,7 +69,7 @@ def test_defaults() -> None:
 
 
 def test_values_derived_from_the_motor() -> None:
-    config = parse_config(M2_ONLY)
+    config = parse_config(M2_ONLY + "[observer]\nkind = 'ges'\n")
     assert config.gamma * (2 * 10 * 0.59) ** 2 == pytest.approx(70.0, rel=1e-14)
     assert config.epsilon == pytest.approx(0.059, rel=1e-14)
     assert config.current_limit == pytest.approx(0.15 * 6.2 / (1.5 * 3 * 0.59), rel=1e-14)

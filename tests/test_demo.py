@@ -13,6 +13,7 @@ import pytest
 from ipmsm_can.bus.cosim import BusFaults
 from ipmsm_can.cli import demo, main
 from ipmsm_can.cli.demo_sides import Setting, run_in_virtual_time, warm_up
+from ipmsm_can.config import config_from
 from ipmsm_can.drive.profile import demo as demo_profile
 from ipmsm_can.report.summary import compare, summarise
 from ipmsm_can.wire.protocol import MessageKind
@@ -28,7 +29,8 @@ def test_fast_demo_locks_and_shows_it(tmp_path: Path, capsys: pytest.CaptureFixt
     lock = re.search(r"first valid angle \.+ ([\d.]+) s after the first sample, ([\d.]+) s after the rotor", said)
     error = re.search(r"error once valid \.+ ([\d.]+) deg rms, ([\d.]+) deg", said)
     assert lock and error
-    assert 2.5 < float(lock[1]) < 4.6 and 1.0 < float(lock[2]) < 3.0
+    # Before 1.5 s the rotor stands; a twentieth of a turn at 20 rpm is enough.
+    assert 1.5 < float(lock[1]) < 2.0 and 0.05 < float(lock[2]) < 0.5
     assert 0.01 < float(error[1]) < 0.3 and float(error[2]) < 2.0
     assert "80000 at 5000 Hz in 16.0 s" in said
     assert "lost ........................ 0 samples (0 filled in, 0 gaps" in said
@@ -48,6 +50,14 @@ def test_lost_frames_are_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert f"{lost[1]} samples were lost" in (tmp_path / "demo.html").read_text()
 
 
+@pytest.fixture
+def too_strict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No angle is ever as good as these drives want it."""
+    asked = {"motor": {"preset": "m2"}, "estimate": {"valid_sigma": 0.001}}
+    monkeypatch.setattr(Setting, "config", lambda self: config_from(asked))
+
+
+@pytest.mark.usefixtures("too_strict")
 def test_never_locking_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--fast", "--duration", "3", "--out", str(tmp_path)]) == 1
     assert "the angle never became valid" in capsys.readouterr().out
@@ -106,8 +116,9 @@ def test_same_seed_same_run() -> None:
     assert not np.array_equal(a.current, c.current)
 
 
+@pytest.mark.usefixtures("too_strict")
 def test_on_a_bus_inside_the_program(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """3 s are too short to lock; how the machine keeps up is not judged here, but both sides must have spoken."""
+    """It never locks; how the machine keeps up is not judged here, but both sides must have spoken."""
     code = main(["demo", "--duration", "3", "-i", "virtual", "-c", "demo-test", "--out", str(tmp_path)])
     said = capsys.readouterr().out
     assert code == 1 and "the angle never became valid" in said

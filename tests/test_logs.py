@@ -11,7 +11,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ipmsm_can.bus.logs import LogError, LogWriter, read_log, write_log
 from ipmsm_can.bus.pythoncan import block_from_messages
 from ipmsm_can.frames import (
     CAN_EFF_FLAG,
@@ -22,6 +21,7 @@ from ipmsm_can.frames import (
     CANFD_FDF,
     FrameBlock,
 )
+from ipmsm_can.logs import LogError, LogWriter, read_log, write_log
 
 LINES = """\
 (1436509052.249713) vcan0 044#2A366C2BBA
@@ -147,7 +147,7 @@ def test_pieces_of_the_file_join(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     block = random_block(400, 5)
     write_log(tmp_path / "e.log", [block])
     for size in (97, 1000, 4096):
-        monkeypatch.setattr("ipmsm_can.bus.logs._CHUNK_BYTES", size)
+        monkeypatch.setattr("ipmsm_can.logs.candump.CHUNK_BYTES", size)
         reader = read_log(tmp_path / "e.log")
         assert np.array_equal(FrameBlock.concat(reader).raw, block.raw)
         assert reader.bad_lines == 0

@@ -324,9 +324,13 @@ def test_a_rotor_that_starts_to_turn_keeps_its_polarity() -> None:
     assert valid[(counter > 1000) & (counter < 1500)].all()
 
 
-def test_any_partition_gives_the_same_bits() -> None:
-    cosim = standstill.cosimulation(HARD, 9, True, {})
-    cosim.run(0.2)
+@pytest.mark.parametrize(("case", "pause", "end"), [
+    (HARD, 12, Phase.KNOWN), (LINEAR, 12, Phase.REFUSED), (LINEAR, 4000, Phase.PULSES)],
+    ids=["known", "refused", "refused, and a pause"])
+def test_any_partition_gives_the_same_bits(case: standstill.Case, pause: int, end: Phase) -> None:
+    """A long pause ends a refusal where it stands, not at the end of the block."""
+    cosim = standstill.cosimulation(case, 9, True, {})
+    cosim.run(0.3)
     samples = np.concatenate([t.run.values for t in cosim.recording.tracked[0]], axis=1)
     node: Any = cosim.companion.nodes[0]
     settings = node._startup_settings
@@ -339,15 +343,17 @@ def test_any_partition_gives_the_same_bits() -> None:
         parts = []
         for a, b in pairwise(cuts):
             gap = np.zeros(b - a, np.int64)
-            if a <= 300 < b:
-                gap[300 - a] = 12
+            at = 300 if pause == 12 else 1200
+            if a <= at < b:
+                gap[at - a] = pause
             parts.append(startup.process(np.ascontiguousarray(samples[:, a:b]), gap, np.zeros(b - a, np.uint8)))
-        assert startup.phase is Phase.KNOWN
+        assert startup.phase is end
+        assert end is Phase.KNOWN or not any(np.any(p.flags & confidence.VALID) for p in parts)
         outcomes.append((np.concatenate([p.flux for p in parts], axis=1), np.concatenate([p.flags for p in parts]),
                          np.concatenate([p.sigma for p in parts]), startup.angle, startup.evidence.asymmetry))
     for other in outcomes[1:]:
         for a, b in zip(outcomes[0], other, strict=True):
-            assert np.array_equal(a, b)
+            np.testing.assert_array_equal(a, b)
 
 
 def test_a_drive_that_does_not_answer_is_not_asked_for_ever() -> None:

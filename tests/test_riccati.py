@@ -395,10 +395,13 @@ def test_a_scheduled_gain_gives_the_same_bits_in_any_blocks() -> None:
 def test_what_the_configuration_says_of_both() -> None:
     m2 = '[motor]\npreset = "m2"\n[observer]\n'
     assert parse_config(m2 + 'kind = "riccati"\n').alpha == 100.0
-    assert parse_config(m2).alpha == 10.0
+    assert parse_config(m2 + "gamma = 3\n").alpha == 10.0
     assert parse_config(m2 + 'kind = "riccati"\nalpha = 40\n').alpha == 40.0
     with pytest.raises(ValueError, match=r"observer.gamma.*only ges has a schedule"):
-        parse_config(m2 + 'kind = "riccati"\ngamma = "scheduled"\n')
+        parse_config(m2 + 'kind = "chonam"\ngamma = "scheduled"\n')
+    assert parse_config(m2).observer.kind == "riccati"
+    assert parse_config(m2 + "gamma = 3\n").observer.kind == "ges"
+    assert parse_config(m2 + 'kind = "riccati"\ngamma = 3\n').observer.kind == "riccati"
     with pytest.raises(ValueError, match=r'observer.gamma is "fast"; allowed is .*or "scheduled"'):
         parse_config(m2 + 'gamma = "fast"\n')
     with pytest.raises(ValueError, match=r"observer.resistance_uncertainty is 120"):

@@ -121,6 +121,7 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever:
     motor = node.config.build_motor()
     live = view.state in (CompanionState.STARTING, CompanionState.TRACKING, CompanionState.LOCKED)
     flags = view.flags if live else 0
+    delay = node.estimator.voltage_delay if node.estimator is not None else None
     return NodeStatus(
         node=node.number, motor=motor.name, state=STATE_WORDS[view.state], live=live,
         theta=view.theta, sigma=view.sigma, omega=view.omega, rpm=view.omega / motor.pole_pairs * RPM,
@@ -133,6 +134,7 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever:
         duplicates=count("duplicates"), reordered=count("reordered"), resyncs=count("resyncs"),
         restarts=count("restarts"), bad_frames=node.bad_frames, rejected_commands=node.rejected_commands,
         clipped=count("clipped"), distrusting=node.distrusting,
+        timing=delay.words if delay is not None and delay.applied else "",
         ever_locked=bool(ever & confidence.LOCKED), ever_valid=bool(ever & confidence.VALID))
 
 

@@ -64,7 +64,7 @@ def line(status: Status) -> str:
         text += f" | drive {n.node} {n.state}"
         if n.live:
             text += (f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm, probing {n.injection}, "
-                     f"lost {n.lost} bad {n.bad_frames}")
+                     f"lost {n.lost} bad {n.bad_frames}" + (f", {n.timing}" if n.timing else ""))
     return text
 
 
@@ -91,6 +91,8 @@ def summary(status: Status) -> str:
                      + ", ".join(f"{name} {count}" for name, count in losses(n)))
         known = f", {n.trust}, {angle(n).strip()}, {n.rpm:+.1f} rpm" if n.live else ""
         lines.append(f"  last: {n.state}{known}")
+        if n.timing:
+            lines.append(f"  {n.timing}")
         if not n.ever_locked:
             lines.append("  the observer never locked: no angle of this drive could be used")
         elif not n.ever_valid:

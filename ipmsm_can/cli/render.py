@@ -93,7 +93,7 @@ def _node(node: NodeStatus, width: int) -> list[Text]:
     if node.rejected_commands:
         probing.append(f"  {node.rejected_commands} commands refused", style="red")
     losses = plain.losses(node)
-    return [
+    lines = [
         head,
         _labelled("angle", f"{plain.angle(node) + ' electrical' if node.known else 'unknown':35}",
                   (node.trust, _trust_style(node))),
@@ -104,6 +104,7 @@ def _node(node: NodeStatus, width: int) -> list[Text]:
         _labelled("", _counts(losses[:4])),
         _labelled("", _counts(losses[4:])),
     ]
+    return [*lines, _labelled("timing", (node.timing, "yellow"))] if node.timing else lines
 
 
 def _row(node: NodeStatus) -> Text:

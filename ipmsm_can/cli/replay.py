@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 HELP = """\
 Run the companion over a recorded log: a summary on the terminal and, with --out, one row per sample.
 
-LOG is candump text (.log, as `candump -L` writes it) or any format python-can reads (.asc .blf .csv .db .mf4
-.trc), packed with .gz or not. Nothing is transmitted.
+LOG is BLF (.blf), candump text (.log, as `candump -L` writes it), MF4 (.mf4, needs asammdf) or another format
+python-can reads (.asc .csv .db .trc; much slower), packed with .gz or not. Nothing is transmitted.
 """
 EPILOG = """\
 columns of --out, one row per sample of the drive, filled ones included:
@@ -47,7 +47,8 @@ examples:
   ipmsm-can replay run.log.gz --drive drive.toml --out estimates.parquet
   ipmsm-can replay both.asc --drive a.toml --drive b.toml --out estimates.csv
 
-exit codes: 0 all well, 1 the log is cut off or damaged (what was readable is replayed), 2 bad input
+exit codes: 0 all well, 2 bad input; a log that is cut off or damaged is bad input, too: what was readable of it is
+replayed, and one sentence says what was wrong
 """
 
 _PROGRESS_S = 0.2
@@ -66,9 +67,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Replay; returns the exit code."""
-    from ipmsm_can.bus.logs import read_log
     from ipmsm_can.config import load_configs
     from ipmsm_can.config.build import build_protocol
+    from ipmsm_can.logs import read_log
 
     log = Path(args.log)
     configs = load_configs(args.drive)
@@ -84,15 +85,15 @@ def main(args: argparse.Namespace) -> int:
               + (", which are written" if paths else ""), file=sys.stderr)
         raise
     print(session.report())
+    if reader.passed_over:
+        print(f"{reader.passed_over} objects of the log hold no CAN frame and were passed over")
     absent = [c for c in configs if not session.replay.summaries[c.wire.node].rows]
     for config in absent:
         print(f"ipmsm-can replay: {_absence(config, session.replay, protocol, log, args.channel)}", file=sys.stderr)
     if reader.problem or reader.bad_lines:
         told = reader.problem or f"{log} is damaged: {reader.bad_lines} of its lines cannot be read"
         print(f"ipmsm-can replay: {told}; what was readable is replayed", file=sys.stderr)
-    if absent:
-        return 2
-    return 1 if reader.problem or reader.bad_lines else 0
+    return 2 if absent or reader.problem or reader.bad_lines else 0
 
 
 def _leave_on_sigterm() -> None:
@@ -170,7 +171,7 @@ class Session:
                 begin = time.monotonic()
                 self.replay.feed(block)
                 self.compute_s += time.monotonic() - begin
-                self._show()
+                self._show(getattr(blocks, "done", 0.0))
         finally:
             begin = time.monotonic()
             for file in self.files.values():
@@ -186,12 +187,13 @@ class Session:
             self.files[node] = open_rows(self._paths[node])
         self.files[node].write(rows)
 
-    def _show(self) -> None:
+    def _show(self, done: float) -> None:
         now = time.monotonic()
         if self._progress and now - self._shown > _PROGRESS_S:
             self._shown = now
             reached = max((s.duration for s in self.replay.summaries.values()), default=0.0)
-            print(f"\r\x1b[Kreplaying: {self.rows} samples, {reached:.0f} s of the log", end="",
+            share = f"{100.0 * done:.0f} %, " if done else ""
+            print(f"\r\x1b[Kreplaying: {share}{self.rows} samples, {reached:.0f} s of the log", end="",
                   file=sys.stderr, flush=True)
 
     def report(self) -> str:
@@ -221,6 +223,9 @@ def _node_lines(number: int, s: NodeSummary, replay: Replay) -> list[str]:
         return [f"node {number}: no samples", lines[1]]
     lines.append(f"  lock       {_when('first locked', s.first_locked)}, locked {_share(s.locked, s.rows)}; "
                  f"{_when('first valid', s.first_valid)}, valid {_share(s.valid, s.rows)} of the samples")
+    timing = node.estimator.voltage_delay.words if node.estimator is not None else ""
+    if timing:
+        lines.append(f"  timing     {timing}")
     encoder = s.encoder
     if encoder.compared:
         lines.append(f"  encoder    error {math.degrees(encoder.rms):.3f} deg rms, "

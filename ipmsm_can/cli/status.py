@@ -19,6 +19,7 @@ class NodeStatus:
     hf_current, amplitude: measured current [A peak] and asked voltage [V peak] of the probing signal.
     injection: state and reason in words.  injecting: what the drive says.
     clipped: samples cut off at the end of their range; distrusting: what they spoiled has not faded yet.
+    timing: how the voltage's timing is set right, "" where it is taken as it comes.
     ever_locked, ever_valid: the angle was, at some time since the beginning.
     sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
     """
@@ -54,6 +55,7 @@ class NodeStatus:
     rejected_commands: int
     clipped: int = 0
     distrusting: bool = False
+    timing: str = ""
     ever_locked: bool = True
     ever_valid: bool = True
 

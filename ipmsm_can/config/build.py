@@ -33,7 +33,8 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
                              o.excitation_window, o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
                              config.estimate.valid_sigma, config.injection.frequency,
                              o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
-                             o.adapt_resistance, o.gamma == "scheduled")
+                             o.adapt_resistance, o.gamma == "scheduled",
+                             o.voltage_delay if isinstance(o.voltage_delay, float) else None)
 
 
 def injection_settings(config: DriveConfig) -> InjectionSettings:

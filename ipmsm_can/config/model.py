@@ -133,10 +133,11 @@ class ObserverConfig(Section):
 
     kind: Annotated[ObserverKind, Choice(
         doc="Observer; ges is the one of the paper's Proposition 1, riccati its regression in a Kalman filter, "
+            "the default unless a gamma is given, "
             "which has no gain to choose and knows its uncertainty. The spmsm kinds are for motors with "
             "L_d = L_q; "
             "the injection kinds need a salient motor that injects at injection.frequency, find the angle modulo "
-            "half a turn, and never call it valid.", choices=OBSERVER_KINDS)] = "ges"
+            "half a turn, and never call it valid.", choices=OBSERVER_KINDS)] = "riccati"
     alpha: Annotated[float | None, Quantity(
         doc="Bandwidth of the regression's filters (the paper's alpha). In the spmsm_gradient and injection kinds "
             "the angle does not depend on it.",
@@ -177,6 +178,19 @@ class ObserverConfig(Section):
             "the samples tell; else they count as noise.")] = True
     adapt_resistance: Annotated[bool, Switch(
         doc="Whether riccati estimates the error of motor.R as well.")] = True
+    voltage_delay: Annotated[float | Literal["auto"], QuantityOrWord(
+        doc="How late the reported voltage is against the current; 0: as said in docs/wire.md. auto takes it for 0 "
+            "until the probing signal shows another one.", unit=units.SAMPLES, least=-2, most=2,
+        word="auto")] = "auto"
+
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_gain_means_a_gradient(cls, value: Any) -> Any:
+        # A file with the paper's gains and no kind means the paper's observer.
+        if isinstance(value, dict) and "kind" not in value and "gamma" in value:
+            return {**value, "kind": "ges"}
+        return value
 
 
 class EstimateConfig(Section):

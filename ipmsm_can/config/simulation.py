@@ -12,6 +12,7 @@ from ipmsm_can.config.section import KeyProblem, Section
 from ipmsm_can.drive.parameters import (
     ANGLE_SOURCES,
     FINEST_CURRENT_LOOP,
+    LATEST_VOLTAGE,
     AngleSource,
     DriveNodeSettings,
     DriveParameters,
@@ -62,6 +63,13 @@ class SimulationConfig(Section):
     adc_step: Annotated[float, Quantity(
         doc="Resolution of the current samples; 0 = no steps.", unit=units.AMPERE,
         least=0)] = DriveParameters.adc_step
+    voltage_delay: Annotated[float, Quantity(
+        doc="How late the reported voltage is; 0 as the wire wants it, 1 the one of the period before, -1 the one "
+            "that has just begun.", unit=units.SAMPLES, least=-1,
+        most=LATEST_VOLTAGE)] = DriveParameters.voltage_delay
+    sampling_lead: Annotated[float, Quantity(
+        doc="How long before the voltage's step the current is sampled, below 1; 0.5: in the middle of a period.",
+        unit=units.SAMPLES, least=0, most=0.99)] = DriveParameters.sampling_lead
     friction: Annotated[float, Quantity(
         doc="Viscous friction at the shaft.", unit=units.FRICTION, least=0)] = DriveParameters.friction
     saturation: Annotated[float, Quantity(

@@ -14,6 +14,9 @@ from ipmsm_can.motor import Motor
 FINEST_CURRENT_LOOP = 12.0
 """Least ratio of sample rate to current bandwidth: with 1.5 periods of delay it leaves 45 deg of phase."""
 
+LATEST_VOLTAGE = 4
+"""Most samples by which the reported voltage may be late."""
+
 AngleSource = Literal["encoder", "companion", "encoder_then_companion"]
 ANGLE_SOURCES: tuple[str, ...] = get_args(AngleSource)
 """What the control may take its angle from."""
@@ -38,6 +41,10 @@ class DriveParameters:
     current_noise: standard deviation of the sensor noise per axis (alpha, beta) [A], >= 0.
     current_offset: sensor offset (alpha, beta) [A].
     adc_step: resolution of the current samples [A], 0 for none.
+    voltage_delay: how late the reported voltage is [samples], -1..4: the mean over the interval that ended so
+        much before the voltage's last step; 0 is the convention of the wire, -1 the voltage just begun.
+    sampling_lead: time by which the current is sampled before the voltage's step [samples], 0 up to below 1;
+        half is a current taken in the middle.  Everything sampled, the rotor's angle included, is of that instant.
     friction: viscous [N m s/rad mechanical], >= 0.
     saturation: share by which L_d falls at rated positive d current, 0..0.5; 0: linear magnetics.
     speed_imposed: a load machine makes the rotor follow the profile's speed exactly; the drive then
@@ -70,6 +77,8 @@ class DriveParameters:
     current_noise: float = 0.02
     current_offset: tuple[float, float] = (0.0, 0.0)
     adc_step: float = 0.0
+    voltage_delay: float = 0.0
+    sampling_lead: float = 0.0
     friction: float = 0.0
     saturation: float = 0.0
     speed_imposed: bool = False
@@ -108,6 +117,9 @@ class DriveParameters:
         if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
             raise ValueError(f"current_offset is {self.current_offset!r}; "
                              "allowed are two finite numbers, in A")
+        _within("voltage_delay", self.voltage_delay, -1.0, LATEST_VOLTAGE, "samples")
+        if not 0.0 <= self.sampling_lead < 1.0:
+            raise ValueError(f"sampling_lead is {self.sampling_lead!r}; allowed is 0 to below 1 sample")
         if self.speed_imposed and self.rotor_locked:
             raise ValueError("speed_imposed and rotor_locked are both true; allowed is one of them at most")
         if self.angle_source not in ANGLE_SOURCES:

@@ -7,6 +7,11 @@ t_(k+1) to t_(k+2), while the voltage made at t_(k-1) is being applied.  Sample 
 t_k and the commanded voltage of the interval that ended at t_k, which is exactly its mean; an injection
 command given before sample k therefore first shows in the voltage of sample k + 2.
 
+That is the convention; a drive can break it.  `sampling_lead` moves all that is sampled ahead of the voltage's
+steps: t_k is then the instant of the current, and the voltage steps `sampling_lead` samples after it.
+`voltage_delay` reports an older voltage, or the mean over parts of two.  So the reported voltage is late against
+the current by voltage_delay - sampling_lead.
+
 The probing voltage of a block is made before the block is simulated, by the generator here or by somebody else:
 it depends on commands only, and those come between blocks.
 """
@@ -52,6 +57,7 @@ from ipmsm_can.drive.machine import (
     stationary_current,
     wrap,
 )
+from ipmsm_can.drive.parameters import LATEST_VOLTAGE
 from ipmsm_can.drive.parameters import DriveParameters as DriveParameters
 from ipmsm_can.drive.profile import Profile, value_at
 from ipmsm_can.injection import waveform as probing
@@ -72,14 +78,18 @@ D_OFFSET_BETA = 8  # A
 D_ADC_STEP = 9  # A
 D_INJECTION_LIMIT = 10  # V
 D_INJECTION_RAMP = 11  # V/s
-D_SIZE = 12
+D_VOLTAGE_DELAY = 12  # samples
+D_SAMPLING_LEAD = 13  # samples
+D_SIZE = 14
 
-# Voltage state, float64 (V_SIZE,): (alpha, beta) of the interval that ended, then of the one that begins
+# Voltage state, float64 (V_SIZE,): (alpha, beta) of the interval that ended, then of the one that begins, and of
+# those before the one that ended, latest first
 V_ENDED = 0
 V_BEGINS = 2
 V_INJ_ENDED = 4
 V_INJ_BEGINS = 6
-V_SIZE = 8
+V_PAST = 8
+V_SIZE = V_PAST + 2 * LATEST_VOLTAGE
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +98,8 @@ class DriveSamples:
 
     sample: int64, sample counter, 0 for the first sample of the simulation.
     i_alpha, i_beta: measured current at t_k [A], with noise, offset and ADC steps.
-    v_alpha, v_beta: mean commanded voltage over the interval that ended at t_k [V].
+    v_alpha, v_beta: mean commanded voltage over the interval that ended at t_k, or the one that the drive reports
+        in its place [V].
     theta_e: true rotor angle at t_k [rad electrical], -pi..pi.  omega_e: true speed [rad/s electrical].
     i_d, i_q: true current [A].  torque: air-gap torque [N m].
     load_torque: the profile's load torque [N m] (the torque reference with an imposed or locked rotor).
@@ -140,6 +151,38 @@ def _probe(out: Array, inj: Array, d: Array) -> None:
 
 
 @kernel
+def _step_voltage(back: int) -> int:
+    """Where the alpha voltage of `back` periods before the one that ended stands in v; -1: the one that begins."""
+    return V_BEGINS if back < 0 else V_ENDED if back == 0 else V_PAST + 2 * (back - 1)
+
+
+@kernel
+def _reported(v: Array, axis: int, delay: float) -> float:
+    """Mean commanded voltage [V] over the interval that ended `delay` samples before the voltage's last step."""
+    back = math.floor(delay)
+    part = delay - back
+    latest = v[_step_voltage(back) + axis]
+    return float(latest if part == 0.0 else (1.0 - part) * latest + part * v[_step_voltage(back + 1) + axis])
+
+
+@kernel
+def _advance_period(x: Array, v: Array, load: float, free_shaft: bool, omega_end: float, m: Array,
+                    d: Array) -> None:
+    """One sampling period: what is left of the voltage before its step, then the one that begins."""
+    period = d[D_PERIOD]
+    substeps = int(d[D_SUBSTEPS])
+    lead = d[D_SAMPLING_LEAD]
+    if lead > 0.0:
+        omega_m = x[X_OMEGA_M]
+        advance(x, v[V_ENDED], v[V_ENDED + 1], load, lead * period, max(1, round(lead * substeps)), free_shaft,
+                omega_m + lead * (omega_end - omega_m), d[D_DEAD_TIME_VOLTAGE], d[D_DEAD_TIME_ZONE], m)
+        substeps = max(1, round((1.0 - lead) * substeps))
+        period *= 1.0 - lead
+    advance(x, v[V_BEGINS], v[V_BEGINS + 1], load, period, substeps, free_shaft, omega_end,
+            d[D_DEAD_TIME_VOLTAGE], d[D_DEAD_TIME_ZONE], m)
+
+
+@kernel
 def _simulate(
     out: Array, first: int, noise: Array, probe: Array, x: Array, s: Array, v: Array, a: Array, m: Array, c: Array,
     d: Array, g: Array, speed_track: Array, load_track: Array,
@@ -171,8 +214,8 @@ def _simulate(
                                         d[D_ADC_STEP])
         out[0, j] = measured_alpha
         out[1, j] = measured_beta
-        out[2, j] = v[V_ENDED]
-        out[3, j] = v[V_ENDED + 1]
+        out[2, j] = _reported(v, 0, d[D_VOLTAGE_DELAY])
+        out[3, j] = _reported(v, 1, d[D_VOLTAGE_DELAY])
         out[4, j] = theta_e
         out[5, j] = omega_e
         out[6, j] = i_d
@@ -218,9 +261,11 @@ def _simulate(
             v_alpha, v_beta = regulate_current(s, c, measured_alpha, measured_beta, 0.0, 0.0, 0.0, 0.0,
                                                inj_alpha, inj_beta)
 
-        advance(x, v[V_BEGINS], v[V_BEGINS + 1], load_mean, period, substeps, free_shaft, omega_end,
-                d[D_DEAD_TIME_VOLTAGE], d[D_DEAD_TIME_ZONE], m)
+        _advance_period(x, v, load_mean, free_shaft, omega_end, m, d)
+        for place in range(V_SIZE - 1, V_PAST + 1, -1):
+            v[place] = v[place - 2]
         for axis in range(2):
+            v[V_PAST + axis] = v[V_ENDED + axis]
             v[V_ENDED + axis] = v[V_BEGINS + axis]
             v[V_INJ_ENDED + axis] = v[V_INJ_BEGINS + axis]
         v[V_BEGINS] = v_alpha
@@ -253,7 +298,7 @@ class DriveSimulation:
         self._drive = np.array([
             period, p.substeps, not (p.speed_imposed or p.rotor_locked), p.rotor_locked,
             p.dead_time_voltage, p.dead_time_zone, p.current_noise, *p.current_offset, p.adc_step,
-            p.injection_limit, p.injection_ramp,
+            p.injection_limit, p.injection_ramp, p.voltage_delay, p.sampling_lead,
         ], dtype=np.float64)
         self._speed_track, self._load_track = profile.tracks(p.sample_rate)
         omega_m = 0.0 if p.rotor_locked else value_at(self._speed_track, 0.0, False)
@@ -261,7 +306,9 @@ class DriveSimulation:
         self._s = np.zeros(control.S_SIZE)
         self._v = np.zeros(V_SIZE)
         omega_e = motor.pole_pairs * omega_m
-        for place, middle in ((V_ENDED, -0.5), (V_BEGINS, 0.5)):
+        past = [(V_PAST + 2 * k, -1.5 - k) for k in range(LATEST_VOLTAGE)]
+        for place, after in ((V_ENDED, -0.5), (V_BEGINS, 0.5), *past):
+            middle = after + p.sampling_lead
             angle = theta_0 + middle * omega_e * period
             self._v[place] = -omega_e * motor.psi_m * math.sin(angle)
             self._v[place + 1] = omega_e * motor.psi_m * math.cos(angle)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation import confidence, excitation, regression, speed
+from ipmsm_can.estimation import confidence, excitation, regression, speed, timing
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
 from ipmsm_can.estimation.observers import common, riccati
@@ -19,6 +19,7 @@ from ipmsm_can.estimation.observers.kinds import KINDS, MODULO_PI, RICCATI
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
 from ipmsm_can.estimation.regression import regression_block
 from ipmsm_can.estimation.speed import speed_block
+from ipmsm_can.estimation.timing import align_block, carry_block
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -42,6 +43,7 @@ class EstimatorSettings:
     valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
     For riccati: 1-sigma of the resistance and the inductances as shares of them, and which errors of the voltage
     are estimated.  scheduled: whether the gain of ges follows the speed.
+    voltage_delay: how late the reported voltage is [samples], -2..2; None: 0 until another one is found.
     """
 
     kind: str
@@ -60,6 +62,7 @@ class EstimatorSettings:
     adapt_voltage: bool = True
     adapt_resistance: bool = True
     scheduled: bool = False
+    voltage_delay: float | None = None
 
     @property
     def uncertainty(self) -> Uncertainty:
@@ -99,12 +102,16 @@ def estimate_block(samples: Floats, regression_parameters: Records, regression_s
                    observer_parameters: Records, observer_state: Records, speed_state: Records,
                    excitation_state: Records, confidence_state: Records, regressed: Floats, flux: Floats,
                    angle: Floats, excited: Floats, sigma: Floats, flags: NDArray[np.uint8]) -> None:
-    """The five steps over a block in one call: on a live bus the calls cost more than the work."""
-    regression_block(samples, regression_parameters, regression_state, regressed)
-    observer_block(samples, regressed, observer_parameters, observer_state, flux)
+    """All steps over a block in one call: on a live bus the calls cost more than the work."""
+    aligned = np.empty(samples.shape)
+    ahead = np.empty(samples.shape[1], np.int64)
+    align_block(samples, regression_state["timing"], aligned, ahead)
+    regression_block(aligned, regression_parameters, regression_state, regressed)
+    observer_block(aligned, regressed, observer_parameters, observer_state, flux)
     speed_block(flux, speed_state, angle)
     excitation_block(regressed, excitation_state, excited)
     confidence_block(regressed, flux, angle, confidence_state, sigma, flags)
+    carry_block(samples, ahead, regression_state["timing"], flux, angle)
 
 
 class Estimator:
@@ -122,6 +129,8 @@ class Estimator:
         self._assumed = common.assumed_motor(kind, motor)
         self._regression_parameters = regression.parameters(self._assumed, s.alpha, sample_rate)
         self._regression = np.zeros(1, regression.STATE)
+        self._regression["timing"] = timing.new_state(self._assumed, s.voltage_delay, s.injection_frequency,
+                                                      sample_rate, s.uncertainty, s.speed_bandwidth)
         self._observer_parameters = common.parameters(kind, self._assumed, s.alpha, s.gamma, s.epsilon, sample_rate,
                                                       s.injection_frequency, s.current_noise, s.uncertainty)
         self._observer_parameters["pole"] = speed.pole(s.speed_bandwidth, sample_rate)
@@ -147,6 +156,11 @@ class Estimator:
     def lost_locks(self) -> int:
         """How often lock was given up because the innovation did not fit."""
         return int(self._confidence["lost"][0])
+
+    @property
+    def voltage_delay(self) -> timing.VoltageDelay:
+        """How late the voltage is against the current: set right, and found."""
+        return timing.known(self._regression["timing"])
 
     def process(self, samples: Floats, gap: NDArray[np.int64] | None = None) -> EstimateBlock:
         """Run a block.
@@ -218,8 +232,10 @@ class Estimator:
     def _restart(self, missing: int, first: Floats) -> None:
         """Start the filters anew before the sample `first` (4,), `missing` samples after the last one."""
         s = self.settings
-        elapsed = (max(missing, 0) + 1) / self.sample_rate
-        self._regression[:] = np.zeros(1, regression.STATE)
+        # The observer stands at the current that was handed on last, which may be older than the last reported.
+        elapsed = (max(missing, 0) + 1 + int(self._regression["timing"]["ahead"][0])) / self.sample_rate
+        timing.restart(self._regression["timing"])
+        self._regression["started"] = 0
         old = self._observer[0]
         if elapsed > FORGET_AFTER or not self._speed["started"][0]:
             self._speed = speed.new_state(s.speed_bandwidth, s.epsilon, self.sample_rate)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
+from ipmsm_can.estimation import timing
 from ipmsm_can.estimation.filters import filter_coefficients
 from ipmsm_can.motor import Motor
 
@@ -37,6 +38,8 @@ STATE = np.dtype([
     ("fe_a", "f8"), ("fe_b", "f8"),
     ("fi_a", "f8"), ("fi_b", "f8"),
     ("product", "f8"), ("f_product", "f8"),
+    # What sets the samples right before they come here; it starts anew with the filters.
+    ("timing", timing.STATE),
 ])
 
 # Rows of the array that the regression hands to an observer.

@@ -100,9 +100,11 @@ def companion_config(setup: Setup, watcher: Watcher, probing: Probing | None = N
     if setup.probing is not None:
         injection["frequency"] = setup.probing.frequency
     if probing is not None:
-        # What the paper injects is not negotiable: neither the current limit nor the speed shall cut it.
+        # What the paper injects is not negotiable: neither the current limit nor the speed shall cut it, and no
+        # pulses go before.
         injection = {"waveform": probing.waveform, "amplitude": probing.amplitude, "frequency": probing.frequency,
-                     "axis": probing.axis, "ramp": 1e6, "current_limit": 1e3, "period": _LOOK_S}
+                     "axis": probing.axis, "ramp": 1e6, "current_limit": 1e3, "period": _LOOK_S,
+                     "polarity": False}
     return config_from({"motor": motor, "observer": observer, "injection": injection}, source=f"{watcher.kind}")
 
 

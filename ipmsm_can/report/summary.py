@@ -65,7 +65,7 @@ class Summary:
     lock_time: from the drive's first sample to the first valid angle; motion_time: to the first motion of
     the rotor; lock_after_motion: between the two.  valid_share: of the time after the first valid angle.
     samples, lost, filled, gaps, duplicates, reordered, restarts, bad_frames, clipped: of the drive's samples.
-    load_mean, load_peak: 0..1.
+    load_mean, load_peak: 0..1.  timing: how the voltage's timing was set right, "" where it was taken as it came.
     """
 
     bus: BusFigures
@@ -91,6 +91,7 @@ class Summary:
     load_peak: float
     frames: dict[MessageKind, int]
     clipped: int = 0
+    timing: str = ""
 
     @property
     def lock_after_motion(self) -> float:
@@ -165,6 +166,7 @@ def summarise(record: Record, node: Node, bus: BusFigures) -> Summary:
     after = c.time >= lock
     count = node.receiver.sequencer.count
     load = record.load[record.load > 0.0]
+    delay = node.estimator.voltage_delay if node.estimator is not None else None
     settled = load[10:] if load.size > 20 else load  # the first second's window is not full
     return Summary(
         bus=bus,
@@ -183,6 +185,7 @@ def summarise(record: Record, node: Node, bus: BusFigures) -> Summary:
         load_peak=float(settled.max()) if settled.size else math.nan,
         frames=record.frames,
         clipped=count("clipped"),
+        timing=delay.words if delay is not None and delay.applied else "",
     )
 
 
@@ -225,6 +228,7 @@ def rows(s: Summary) -> list[tuple[str, str]]:
         ("samples", f"{s.samples} at {number(s.sample_rate, 'g', 'Hz')} in {s.duration:.1f} s"),
         ("lost", f"{s.lost} samples ({trouble}), {s.bus.drops} frames dropped by the kernel, "
                  f"{s.bus.unsent} not sent"),
+        *([("timing", s.timing)] if s.timing else []),
         ("bus load", f"{number(100.0 * s.load_mean, '.0f', '%')} on average, "
                      f"{number(100.0 * s.load_peak, '.0f', '%')} in the busiest second"),
         ("turnaround p50 / p99 / p99.9", timing),

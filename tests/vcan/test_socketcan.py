@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ipmsm_can.bus.logs import read_log
 from ipmsm_can.bus.port import BusError, Port, open_port
 from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.frames import (
@@ -22,6 +21,7 @@ from ipmsm_can.frames import (
     CANFD_FDF,
     FrameBlock,
 )
+from ipmsm_can.logs import read_log
 
 SENT = ["123#0102030405060708", "7FF#", "1ABCDEF0#DEADBEEF", "00000001#11", "321#R", "321#R5",
         "100##1" + "A5" * 64, "101##0" + "00112233445566778899AABB", "12345678##3" + "FF" * 20, "000#00"]

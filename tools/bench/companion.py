@@ -25,7 +25,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("channel")
     parser.add_argument("--silent", action="store_true", help="only listen")
-    parser.add_argument("--observer", default="ges", help="its kind")
+    parser.add_argument("--observer", default="riccati", help="its kind")
     args = parser.parse_args()
     config = config_from({"motor": {"preset": "m2"}, "observer": {"kind": args.observer},
                           "injection": {"enabled": False}})

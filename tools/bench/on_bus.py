@@ -152,8 +152,8 @@ def main() -> int:
     parser.add_argument("--channel", default="vcan0")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--rate", type=float, default=5000.0)
-    parser.add_argument("--only", help="subjects, by comma: companion, companion_riccati, listening, recv, loop, "
-                                       "echo, spaced, recv_spaced, echo_spaced, companion_fd")
+    parser.add_argument("--only", help="subjects, by comma: companion, companion_ges, listening, recv, loop, echo, "
+                                       "spaced, recv_spaced, echo_spaced, companion_fd")
     args = parser.parse_args()
     c, rate, s = args.channel, args.rate, args.seconds
     ours = ["tools.bench.companion", c]
@@ -161,7 +161,7 @@ def main() -> int:
     # itself, at half the rate, as both together are too much for one slow processor.
     subjects: dict[str, tuple[str, list[str], float, bool, float]] = {
         "companion": ("companion, answering at 1 kHz", ours, rate, False, TICK),
-        "companion_riccati": ("companion, Riccati observer", [*ours, "--observer", "riccati"], rate, False, TICK),
+        "companion_ges": ("companion, the paper's observer", [*ours, "--observer", "ges"], rate, False, TICK),
         "listening": ("companion, listening only", [*ours, "--silent"], rate, False, TICK),
         "recv": ("python-can recv alone", ["tools.bench.rivals", "recv", c, "5"], rate, False, TICK),
         "loop": ("python-can + cantools loop", ["tools.bench.rivals", "loop", c, "5"], rate, False, TICK),

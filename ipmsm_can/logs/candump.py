@@ -5,14 +5,62 @@
     (1700000000.000000) can0 123##1AABB                  CAN FD, one digit of flags
 
 The fraction may have any number of digits; what follows the payload (R or T, a raw DLC) is passed over.
+Time stamps stay exact and error frames keep their details; through python-can's messages both would be lost.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs.source import CHUNK_BYTES, Filling, LogError, Outcome, Request, Source
+
+_LONGEST_LINE = 1 << 12
+
+
+def read_candump(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
+    """Blocks of a candump text.  Raises LogError where none of its lines reads like one."""
+    channel = np.frombuffer((request.channel or "").encode(), np.uint8)
+    counts = np.zeros(2, np.int64)
+    filling = Filling(request.block_frames)
+    with Source(request.path, request.packed) as source:
+        for text in _texts(source, counts):
+            characters, at = np.frombuffer(text, np.uint8), 0
+            while at < len(characters):
+                block = filling.block
+                at, filling.rows = parse(characters, at, channel, block.raw, block.t_ns, filling.rows, counts)
+                outcome.bad_lines = int(counts[1])
+                if filling.full:
+                    outcome.done = source.done
+                    yield filling.take()
+        outcome.problem = source.problem
+    outcome.bad_lines = int(counts[1])
+    outcome.done = 1.0
+    if counts[1] and not counts[0] and not request.channel:
+        raise LogError(f"{request.path} is no candump log: none of its {counts[1]} lines reads like "
+                       "'(1700000000.000000) can0 123#0102'")
+    if filling.rows:
+        yield filling.take()
+
+
+def _texts(source: Source, counts: NDArray[np.int64]) -> Iterator[bytes]:
+    """The file in pieces that end with a line; what was readable of a damaged one."""
+    rest = b""
+    while piece := source.some(CHUNK_BYTES):
+        text = rest + piece
+        cut = text.rfind(b"\n") + 1
+        rest = text[cut:]
+        if len(rest) > _LONGEST_LINE:
+            counts[1] += 1
+            rest = b""
+        if cut:
+            yield text[:cut]
+    if rest:
+        yield rest
 
 
 @kernel
@@ -158,6 +206,12 @@ def parse(text: NDArray[np.uint8], start: int, channel: NDArray[np.uint8], raw: 
             counts[0] += 1
         at = end + 1
     return at, rows
+
+
+def warm_up() -> None:
+    """Compile or load the kernel that reads, before there is anything to measure."""
+    nothing = np.frombuffer(b"", np.uint8)  # read-only, as every piece of a file is: numba compiles for that
+    parse(nothing, 0, nothing, np.zeros((1, 72), np.uint8), np.zeros(1, np.int64), 0, np.zeros(2, np.int64))
 
 
 @kernel
