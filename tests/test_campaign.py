@@ -122,7 +122,7 @@ def test_the_wire_and_the_estimate_behind_it_say_the_same() -> None:
     place = {int(a): k for k, a in enumerate(c.at)}
     rows = np.array([place[int(a)] for a in c.said_at])
     assert c.said_at.size > 300
-    assert np.abs(np.remainder(c.said_error - c.error[rows] + 180.0, 360.0) - 180.0).max() < 0.012, "half a step of the wire"
+    assert np.abs(np.remainder(c.said_error - c.error[rows] + 180.0, 360.0) - 180.0).max() < 0.012  # half a step
     assert np.array_equal(c.said_valid, c.valid[rows])
 
 
