@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from ipmsm_can.estimation import confidence, polarity
 from ipmsm_can.estimation.estimator import FORGET_AFTER, EstimateBlock, Estimator
-from ipmsm_can.estimation.observers.riccati import TILT
 from ipmsm_can.estimation.polarity import Verdict, window_block
 from ipmsm_can.motor import Motor
 
@@ -105,6 +104,7 @@ class StartUp:
         self._motor = motor
         self._rate = rate
         self._noise = estimator.settings.current_noise
+        self._tilt = estimator.settings.uncertainty.tilt
         voltage_uncertainty = estimator.settings.voltage_uncertainty
         self._still_below = 2.0 * voltage_uncertainty
         # An error of the voltage turns the axis by half its share, times what b is smaller than a.
@@ -187,7 +187,7 @@ class StartUp:
                 self._to(Phase.AXIS)
             return
         theta, sigma = polarity.axis(self._window, self._noise)
-        tilt = TILT * (polarity.load(self._window) / self._motor.rated_current) ** 2
+        tilt = self._tilt * (polarity.load(self._window) / self._motor.rated_current) ** 2
         sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, self._turned / max(float(self._window["voltage"][0]), 1e-9))
         if not self._window["broken"][0]:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)

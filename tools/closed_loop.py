@@ -37,9 +37,9 @@ AFTER_STEP = 0.4
 """Time after a load step in which the largest speed error counts [s]."""
 SOURCES: dict[str, dict[str, Any]] = {
     "encoder": {}, "ges": {"kind": "ges", "speed_bandwidth": FAST_SPEED_LOOP},
-    "riccati": {"kind": "riccati", "speed_bandwidth": FAST_SPEED_LOOP},
+    "riccati": {"kind": "riccati", "speed_bandwidth": FAST_SPEED_LOOP, "saturation_uncertainty": 0.0},
     "ges, 20 Hz": {"kind": "ges", "speed_bandwidth": 20.0},
-    "riccati, 20 Hz": {"kind": "riccati", "speed_bandwidth": 20.0},
+    "riccati, 20 Hz": {"kind": "riccati", "speed_bandwidth": 20.0, "saturation_uncertainty": 0.0},
 }
 BUS = {
     "ideal": BusFaults(),

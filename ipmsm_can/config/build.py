@@ -34,7 +34,8 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
                              config.estimate.valid_sigma, config.injection.frequency,
                              o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
                              o.adapt_resistance, o.gamma == "scheduled",
-                             o.voltage_delay if isinstance(o.voltage_delay, float) else None)
+                             o.voltage_delay if isinstance(o.voltage_delay, float) else None,
+                             saturation_uncertainty=o.saturation_uncertainty / 100.0)
 
 
 def injection_settings(config: DriveConfig) -> InjectionSettings:

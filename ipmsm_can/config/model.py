@@ -173,6 +173,10 @@ class ObserverConfig(Section):
     inductance_uncertainty: Annotated[float, Quantity(
         doc="1-sigma of motor.L_d and motor.L_q, as a share of them; for riccati.",
         unit=units.PERCENT, least=0, most=100)] = 6.0
+    saturation_uncertainty: Annotated[float, Quantity(
+        doc="By how much L_d may fall at rated current, 1-sigma as a share of it, for riccati and the start-up: "
+            "under load that turns the axis that probing sees. 0 for a machine known not to saturate.",
+        unit=units.PERCENT, least=0, most=50)] = 20.0
     adapt_voltage: Annotated[bool, Switch(
         doc="Whether riccati estimates dead time and a lasting offset of the voltage beside the flux, as far as "
             "the samples tell; else they count as noise.")] = True

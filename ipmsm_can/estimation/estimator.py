@@ -41,7 +41,8 @@ class EstimatorSettings:
     observer's own equation, initial_flux [Wb, Wb], epsilon [Wb];
     excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
     valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
-    For riccati: 1-sigma of the resistance and the inductances as shares of them, and which errors of the voltage
+    For riccati: 1-sigma of the resistance and the inductances as shares of them; by how
+    much L_d falls at rated current, as a share; and which errors of the voltage
     are estimated.  scheduled: whether the gain of ges follows the speed.
     voltage_delay: how late the reported voltage is [samples], -2..2; None: 0 until another one is found.
     """
@@ -63,12 +64,14 @@ class EstimatorSettings:
     adapt_resistance: bool = True
     scheduled: bool = False
     voltage_delay: float | None = None
+    saturation_uncertainty: float = 0.2
 
     @property
     def uncertainty(self) -> Uncertainty:
         """What `riccati` weighs."""
         return Uncertainty(self.voltage_uncertainty, self.current_noise, self.resistance_uncertainty,
-                           self.inductance_uncertainty, self.adapt_voltage, self.adapt_resistance)
+                           self.inductance_uncertainty, self.adapt_voltage, self.adapt_resistance,
+                           self.saturation_uncertainty)
 
 
 @dataclass(frozen=True, slots=True)

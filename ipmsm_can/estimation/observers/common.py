@@ -37,7 +37,7 @@ PARAMETERS = np.dtype([
     ("pole", "f8"), ("scheduled", "i8"),
     # riccati: 1-sigma of what is uncertain [V], [ohm], share of L_q; states of the voltage's error.
     ("L_d", "f8"), ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
-    ("spread_L", "f8"), ("zone", "f8"), ("corner", "f8"), ("rated", "f8"),
+    ("spread_L", "f8"), ("zone", "f8"), ("corner", "f8"), ("rated", "f8"), ("tilt", "f8"),
     ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
 ])
 
@@ -122,7 +122,7 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "L_d": motor.L_d, "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor),
         "volts": u.voltage,
         "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
-        "corner": corner(motor), "rated": motor.rated_current,
+        "corner": corner(motor), "rated": motor.rated_current, "tilt": u.tilt,
         "prior": u.priors(motor), "keep": keeps(sample_rate),
     }
     for name, value in values.items():

@@ -18,8 +18,8 @@ Noise, in physical units, nothing tuned.
     y, coloured    2 psi_m v_r, the same voltage error through F.  It keeps its sign for CORRELATION_TIME, so that
                    many samples together say no more than one: its variance counts 2 CORRELATION_TIME/T_s times
     y, transients  2 psi_m dL |H[i]|: a wrong inductance shows while the current changes
-    cross-saturation   under load the axis of the saliency leaves the rotor's by an angle nobody has measured, TILT
-                   at rated current and with its square below; 2 psi_m L_0 H[i] times that angle shows in y, for as
+    cross-saturation   under load the axis of the saliency leaves the rotor's by an angle nobody has measured,
+                   `tilt` at rated current and with its square below; 2 psi_m L_0 H[i] times that angle shows in y, for as
                    long as the load lasts.  At speed it is small beside Phi; at standstill it is what limits probing
     y, memory      after a loss of lock Lemma 1 does not hold until the filters have forgotten: an error of at most
                    4 alpha psi_m^2 that dies out with exp(-alpha t), the paper's epsilon_t, coloured as well
@@ -57,9 +57,6 @@ SHAPE = 0.5
 """What a phase near zero current loses, 1-sigma as a share of the dead time's voltage."""
 LONGEST = 0.2
 """Longest time [s] for which the shape of dead time is taken to keep its sign."""
-TILT = 0.6
-"""1-sigma [rad electrical] of the angle between rotor and axis of saliency at rated current: that of a machine
-whose L_d falls by a fifth at rated current (`drive.magnetics`)."""
 _SIXTH = 1.0 / 6.0
 INNOVATION_TIME = 0.005
 """Averaging time [s] of the innovation test."""
@@ -370,7 +367,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         coloured = 4.0 * psi_m * psi_m * (residual2 + shape2)
         load_a = i_a - h_a / alpha
         load_b = i_b - h_b / alpha
-        tilt = TILT * (load_a * load_a + load_b * load_b) / (p.rated * p.rated)
+        tilt = p.tilt * (load_a * load_a + load_b * load_b) / (p.rated * p.rated)
         cross2 = (L_0 * min(tilt, 1.0)) ** 2 * h2
         coloured += 4.0 * psi_m * psi_m * cross2
         lasting = 4.0 * psi_m * psi_m * (correlated * residual2 + 2.0 * holds / T_s * (shape2 + cross2))

@@ -35,6 +35,8 @@ RESIDUAL_SHARE = 0.1
 """What none of the four describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
 _KEEPS = (10.0, 10.0, 10.0, 30.0)
 """Time constants [s]: temperature moves all of them."""
+TILT = 3.0
+"""That angle [rad electrical] over the share by which L_d falls at rated current, as `drive.magnetics` has it."""
 CORNER_SHARE = 0.15
 """Phase current, as a share of the rated current, up to which the shape of dead time is uncertain: the output
 capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it."""
@@ -54,6 +56,12 @@ class Uncertainty:
     inductance: float = 0.06
     adapt_voltage: bool = True
     adapt_resistance: bool = True
+    saturation: float = 0.2
+
+    @property
+    def tilt(self) -> float:
+        """1-sigma [rad electrical] of the angle between the rotor and the axis of saliency at rated current."""
+        return TILT * self.saturation
 
     def priors(self, motor: Motor) -> tuple[float, ...]:
         """Prior variances of the four states [V^2, V^2, V^2, ohm^2]."""
