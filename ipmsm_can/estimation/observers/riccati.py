@@ -20,7 +20,7 @@ Noise, in physical units, nothing tuned.
     y, transients  2 psi_m dL |H[i]|: a wrong inductance shows while the current changes
     cross-saturation   under load the axis of the saliency leaves the rotor's by an angle nobody has measured,
                    `tilt` at rated current and with its square below; 2 psi_m L_0 H[i] times that angle shows in
-                   y, for as long as the load lasts.  At speed it is small beside Phi; at standstill it limits probing
+                   y, as long as the load lasts.  At speed it is small beside Phi; at standstill it limits probing
     y, memory      after a loss of lock Lemma 1 does not hold until the filters have forgotten: an error of at most
                    4 alpha psi_m^2 that dies out with exp(-alpha t), the paper's epsilon_t, coloured as well
 The angle's 1-sigma is the covariance across x_hat, the current noise L_q s_i, and dL i_q, each over |x_hat|.
