@@ -53,7 +53,7 @@ Floats = NDArray[np.float64]
 
 CORRELATION_TIME = 0.01
 """Time [s] over which a voltage error that is no state is taken as constant."""
-SHAPE = 0.5
+SHAPE = 0.25
 """What a phase near zero current loses, 1-sigma as a share of the dead time's voltage."""
 LONGEST = 0.2
 """Longest time [s] for which the shape of dead time is taken to keep its sign."""
