@@ -45,20 +45,6 @@ def test_the_shape_of_dead_time_counts_for_phases_near_zero_current() -> None:
     assert voltage_errors.near_zero(0.0, 0.0, 0.5) == pytest.approx(4.0 / 3.0)
 
 
-def test_near_zero_current_at_standstill_sigma_grows_faster_than_under_load() -> None:
-    """Nobody knows what dead time takes near zero current, and at standstill it takes it in one direction."""
-    def grown(i_q: float) -> float:
-        load = (1.5 * M2.pole_pairs * M2.psi_m) * i_q
-        track = Profile(((0.0, 30.0), (0.5, 30.0), (0.7, 0.0)), ((0.0, load),), 1.2)
-        s = DriveSimulation(M2, DriveParameters(sample_rate=RATE, speed_imposed=True), track, 0.3).run(6000)
-        config = parse_config('[motor]\npreset = "m2"\n[observer]\nkind = "riccati"\n')
-        samples = np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
-        out = Estimator(M2, RATE, estimator_settings(config)).process(samples)
-        return float(np.degrees(out.sigma[4500] - out.sigma[3600]))
-
-    assert grown(0.0) > 1.2 * grown(2.3)
-
-
 def test_a_rotor_that_turns_while_it_is_looked_at_is_where_it_is_now() -> None:
     rng = np.random.default_rng(6)
     off = []
