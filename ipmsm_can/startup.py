@@ -42,14 +42,12 @@ _AXIS_SIGMA = math.radians(7.0)
 _WINDOW_SIGMA = math.radians(15.0)
 _MODEL_SIGMA = math.radians(1.0)
 """What the axis of a window may be wrong by besides noise and voltage: saturation, inductances."""
-_LOAD_SIGMA = math.radians(25.0)
-"""What rated current across the axis may turn the seen one by, as the square of its share: cross-saturation.  On
-the simulated machines at a saturation of 0.2 it was 4 to 5 deg at a third, 12.5 at half of rated torque."""
 _DRIFT_SIGMA = math.radians(1.0)
 """What the rotor may move in a window while it stands still."""
 _JUMP = math.radians(30.0)
 _AXIS_WINDOWS = 3
 _COHERENT = 0.9
+_LEAST_LINE = 3
 _PULSES_S = 0.4
 _PAUSE_S = 1.0
 _TRIES = 3
@@ -106,18 +104,20 @@ class StartUp:
         self._motor = motor
         self._rate = rate
         self._noise = estimator.settings.current_noise
+        self._tilt = estimator.settings.uncertainty.tilt
         voltage_uncertainty = estimator.settings.voltage_uncertainty
         self._still_below = 2.0 * voltage_uncertainty
         # An error of the voltage turns the axis by half its share, times what b is smaller than a.
         self._turned = 0.5 * voltage_uncertainty * motor.L_s / abs(0.5 * motor.L_0) if motor.L_0 else math.inf
         self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n)
-        self._back_emf = self._load = 0j
+        self._back_emf = 0j
         self._count = 0
         self._wasted = 0
         self._pause = 0
         self._tries = 0
         self._lost = 0
         self._last_peak = self._raised = 0.0
+        self._turning = _Turning()
         self._begin_axis()
 
     @property
@@ -182,7 +182,7 @@ class StartUp:
         """
         if self.possible and self.phase is Phase.WATCH:
             self.angle, self.sigma = theta, sigma
-            self._back_emf = self._load = 0j
+            self._back_emf = 0j
             self._begin_window()
             self._to(Phase.KNOWN)
 
@@ -214,10 +214,8 @@ class StartUp:
                 self._to(Phase.AXIS)
             return
         theta, sigma = polarity.axis(self._window, self._noise)
-        # Averaged over windows, so that the probing current drops out; the pulses' never has a mean.
-        self._load += 0.25 * (0.5 * complex(self._window["first"][0] + self._window["i"][0]) - self._load)
-        sigma = math.hypot(sigma, _MODEL_SIGMA, self._turned / max(float(self._window["voltage"][0]), 1e-9),
-                           _LOAD_SIGMA * (abs(self._load) / self.settings.current) ** 2)
+        tilt = self._tilt * (polarity.load(self._window) / self._motor.rated_current) ** 2
+        sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, self._turned / max(float(self._window["voltage"][0]), 1e-9))
         broken = bool(self._window["broken"][0])
         if not broken:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)
@@ -231,6 +229,7 @@ class StartUp:
                 self._begin_axis()
         elif self.phase is Phase.PULSES:
             self._track(theta, sigma)
+            self._turning.add(self.angle, theta, sigma)
             self._judge_pulses(still)
             self._look_along(self.angle)  # the pulses show the axis much better than what went before
         else:
@@ -279,8 +278,12 @@ class StartUp:
         if verdict is Verdict.EQUAL:
             self._to(Phase.REFUSED)
         elif verdict is not Verdict.OPEN:
+            angle, sigma = self._turning.now
+            if not sigma < _AXIS_SIGMA:
+                return  # of which end is north there is no doubt, but where it is now nobody knows yet
             if verdict is Verdict.SOUTH:
-                self.angle = math.remainder(self.angle + math.pi, 2.0 * math.pi)
+                angle += math.pi
+            self.angle, self.sigma = math.remainder(angle, 2.0 * math.pi), sigma
             self._to(Phase.KNOWN)
             self.estimator.take_angle(self.angle, self.sigma)
 
@@ -321,6 +324,7 @@ class StartUp:
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
             self._last_peak = self._raised = 0.0
             self._windows_left = round(_PULSES_S * self._rate / self.n)
+            self._turning = _Turning()
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0
 
@@ -330,6 +334,50 @@ class StartUp:
 
     def _begin_axis(self) -> None:
         self._axis_windows, self._axis_weight, self._axis_sum = 0, 0.0, 0j
+
+
+class _Turning:
+    """A straight line through the axes of successive windows: a rotor that turns too slowly for its back-EMF to
+    show moves by tens of degrees while it is looked at."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._sums = np.zeros((2, 2))
+        self._right = np.zeros(2)
+        self._square = self._weight = 0.0
+        self._common2 = math.inf
+        self._last = 0.0
+
+    def add(self, near: float, theta: float, sigma: float) -> None:
+        """Take in a window's axis, modulo pi, on the branch next to `near`."""
+        self._n += 1
+        if not math.isfinite(sigma):
+            return
+        if not self._weight:
+            self._last = near
+        angle = self._last + math.remainder(theta - self._last, math.pi)
+        self._last = angle
+        row = np.array([1.0, self._n])
+        self._sums += np.outer(row, row) / sigma**2
+        self._right += row * angle / sigma**2
+        self._square += angle**2 / sigma**2
+        self._weight += 1.0
+        self._common2 = min(self._common2, sigma**2)
+
+    @property
+    def now(self) -> tuple[float, float]:
+        """Angle at the end of the last window and its 1-sigma [rad electrical]: inf with fewer than three windows.
+
+        What the windows are wrong by besides noise they have in common, so the 1-sigma of the best of them stands
+        beside that of the line.
+        """
+        if self._weight < _LEAST_LINE:
+            return 0.0, math.inf
+        inverse = np.linalg.inv(self._sums)
+        fit = inverse @ self._right
+        scatter = max((self._square - float(self._right @ fit)) / (self._weight - 2.0), 1.0)
+        row = np.array([1.0, self._n + 0.5])
+        return float(row @ fit), math.sqrt(scatter * float(row @ inverse @ row) + self._common2)
 
 
 def pulse_period(motor: Motor, settings: StartUpSettings, sample_rate: float) -> int:

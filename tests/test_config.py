@@ -54,7 +54,8 @@ def test_defaults() -> None:
     assert config.observer.model_dump() == {
         "kind": "riccati", "alpha": None, "gamma": None, "initial_flux": (0.0, 0.0), "epsilon": None,
         "excitation_window": 0.1, "speed_bandwidth": 100.0, "voltage_uncertainty": 0.5, "current_noise": 0.02,
-        "resistance_uncertainty": 12.0, "inductance_uncertainty": 6.0, "adapt_voltage": True,
+        "resistance_uncertainty": 12.0, "inductance_uncertainty": 6.0,
+        "saturation_uncertainty": 20.0, "adapt_voltage": True,
         "adapt_resistance": True, "voltage_delay": "auto",
     }
     assert config.estimate.model_dump() == {

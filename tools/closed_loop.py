@@ -36,11 +36,11 @@ RATE = 5000.0
 AFTER_STEP = 0.4
 """Time after a load step in which the largest speed error counts [s]."""
 SOURCES: dict[str, dict[str, Any]] = {
-    "encoder": {}, "ges": {"kind": "ges"}, "riccati": {"kind": "riccati"},
+    "encoder": {}, "ges": {"kind": "ges"}, "riccati": {"kind": "riccati", "saturation_uncertainty": 0.0},
     "ges, 20 Hz": {"kind": "ges", "speed_bandwidth": 20.0},
-    "riccati, 20 Hz": {"kind": "riccati", "speed_bandwidth": 20.0},
+    "riccati, 20 Hz": {"kind": "riccati", "speed_bandwidth": 20.0, "saturation_uncertainty": 0.0},
     "ges, 60 Hz": {"kind": "ges", "speed_bandwidth": 60.0},
-    "riccati, 60 Hz": {"kind": "riccati", "speed_bandwidth": 60.0},
+    "riccati, 60 Hz": {"kind": "riccati", "speed_bandwidth": 60.0, "saturation_uncertainty": 0.0},
 }
 """Settings of the observer; the natural frequency of its speed loop is to be well above the drive's 15 Hz."""
 BUS = {

@@ -22,6 +22,7 @@ COMMANDS = {
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "paper": "run the paper's experiments again, with a verdict on each claim",
+    "campaign": "thousands of random runs: is an angle called valid ever wrong",
     "config": "explain or check a drive.toml",
     "completion": "print a completion script for your shell",
 }

@@ -53,7 +53,8 @@ def estimator_settings(config: DriveConfig) -> EstimatorSettings:
                              config.estimate.valid_sigma, given if isinstance(given, float) else USUAL_FREQUENCY,
                              o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
                              o.adapt_resistance, o.gamma == "scheduled",
-                             o.voltage_delay if isinstance(o.voltage_delay, float) else None)
+                             o.voltage_delay if isinstance(o.voltage_delay, float) else None,
+                             saturation_uncertainty=o.saturation_uncertainty / 100.0)
 
 
 def injection_settings(config: DriveConfig, sample_rate: float = 0.0) -> InjectionSettings:

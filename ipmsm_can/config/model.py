@@ -68,7 +68,8 @@ class MotorConfig(Section):
         doc="Stator resistance per phase, at working temperature.",
         unit=units.OHM, least=0, most=1000, default=_FROM_PRESET, example="1.059 ohm")] = None
     J: Annotated[float | None, Quantity(
-        doc="Inertia at the shaft, used by the simulated drive only.", unit=units.INERTIA, above=0, most=1e6,
+        doc="Inertia at the shaft, for the simulated drive, and for how far a rotor may turn while "
+            "samples are missing.", unit=units.INERTIA, above=0, most=1e6,
         default=f"{_FROM_PRESET}, or {Motor.__dataclass_fields__['J'].default}",
         example="100 kg cm^2")] = None
     rated_torque: Annotated[float | None, Quantity(
@@ -107,7 +108,8 @@ class WireConfig(Section):
         doc="Samples per second, used until the drive sends DriveTiming, or if it never does.",
         unit=units.HERTZ, least=100, most=100e3, default="wait for DriveTiming", example="10 kHz")] = None
     max_gap: Annotated[int, Quantity(
-        doc="Longest run of lost samples that is filled by interpolation; a longer one restarts the filters.",
+        doc="Longest run of lost samples that is filled by interpolation; a longer one, or one of more than "
+            "1.7 ms, restarts the filters.",
         unit=units.SAMPLES, whole=True, least=0, most=64)] = 8
     bitrate: Annotated[int, Quantity(
         doc="Nominal bit rate, for the bus load.",
@@ -178,6 +180,10 @@ class ObserverConfig(Section):
     inductance_uncertainty: Annotated[float, Quantity(
         doc="1-sigma of motor.L_d and motor.L_q, as a share of them; for riccati.",
         unit=units.PERCENT, least=0, most=100)] = 6.0
+    saturation_uncertainty: Annotated[float, Quantity(
+        doc="By how much L_d may fall at rated current, 1-sigma as a share of it, for riccati and the start-up: "
+            "under load that turns the axis that probing sees. 0 for a machine known not to saturate.",
+        unit=units.PERCENT, least=0, most=50)] = 20.0
     adapt_voltage: Annotated[bool, Switch(
         doc="Whether riccati estimates dead time and a lasting offset of the voltage beside the flux, as far as "
             "the samples tell; else they count as noise.")] = True
@@ -208,7 +214,8 @@ class EstimateConfig(Section):
     status_rate: Annotated[float, Quantity(
         doc="CompanionStatus messages per second.", unit=units.HERTZ, least=1, most=1e3)] = 10.0
     valid_sigma: Annotated[float, Quantity(
-        doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical).",
+        doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical). An error "
+            "of three of them is rare: 5 deg stands for 15 deg at most.",
         unit=units.DEGREE, above=0, most=90)] = 10.0
 
 

@@ -29,6 +29,8 @@ FORGET_AFTER = 0.5
 """A gap in the samples longer than this [s] starts everything anew."""
 _SPEED_DOUBT = 0.1
 """How wrong the extrapolation over a gap may be, relative to the angle turned meanwhile."""
+_TORQUE_DOUBT = 0.25
+"""1-sigma of the torque on the shaft that nobody saw change in a gap, as a share of the rated torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,8 @@ class EstimatorSettings:
     observer's own equation, initial_flux [Wb, Wb], epsilon [Wb];
     excitation_window [s]; speed_bandwidth [Hz]; voltage_uncertainty [V]; current_noise [A rms];
     valid_sigma: largest 1-sigma of a valid angle [deg electrical]; injection_frequency [Hz].
-    For riccati: 1-sigma of the resistance and the inductances as shares of them, and which errors of the voltage
+    For riccati: 1-sigma of the resistance and the inductances as shares of them; by how
+    much L_d falls at rated current, as a share; and which errors of the voltage
     are estimated.  scheduled: whether the gain of ges follows the speed.
     voltage_delay: how late the reported voltage is [samples], -2..2; None: 0 until another one is found.
     """
@@ -61,12 +64,14 @@ class EstimatorSettings:
     adapt_resistance: bool = True
     scheduled: bool = False
     voltage_delay: float | None = None
+    saturation_uncertainty: float = 0.2
 
     @property
     def uncertainty(self) -> Uncertainty:
         """What `riccati` weighs."""
         return Uncertainty(self.voltage_uncertainty, self.current_noise, self.resistance_uncertainty,
-                           self.inductance_uncertainty, self.adapt_voltage, self.adapt_resistance)
+                           self.inductance_uncertainty, self.adapt_voltage, self.adapt_resistance,
+                           self.saturation_uncertainty)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +221,8 @@ class Estimator:
         north = complex(math.cos(theta), math.sin(theta))
         measured = (self._assumed.psi_m + self._assumed.L_0 * (i * north.conjugate()).real) * north
         if kind == RICCATI:
-            x += riccati.take_angle(self._observer, self._assumed.psi_m, x, measured, sigma)
+            x += riccati.take_angle(self._observer, self._assumed.psi_m, self._observer_parameters[0]["prior"], x,
+                                    measured, sigma)
         else:
             x += confidence.take_angle(self._confidence, x, measured, sigma)
         flux = x + self._assumed.L_q * i
@@ -256,11 +262,16 @@ class Estimator:
             pll = self._speed
             turned = float(pll["omega"][0]) * elapsed
             angle = float(pll["theta"][0]) + turned
+            # The acceleration may have ended in the gap, or begun: a load step is not announced.
+            bent = 0.0
             one_step_back, lag = angle - float(pll["omega"][0]) / self.sample_rate, 0.0
             own = KINDS[s.kind] == RICCATI
             if own and self._confidence["locked"][0]:
                 speed_before = float(pll["omega"][0])
                 angle, omega, lag = speed.carried(pll, elapsed)
+                accelerated = (omega - speed.carried(pll, 0.0)[1]) / elapsed
+                unseen = _TORQUE_DOUBT * self.motor.pole_pairs * self.motor.rated_torque / self.motor.J
+                bent = 0.5 * math.hypot(accelerated, unseen) * elapsed**2
                 turned = angle - float(pll["theta_hat"][0])
                 one_step_back = angle - omega / self.sample_rate
                 # The loop goes on with the lag that it had.
@@ -278,7 +289,7 @@ class Estimator:
                 # What was taken for one stretch of time was two, or the other way round.
                 doubt = size * min(abs(missing * float(pll["omega"][0])) / self.sample_rate, math.pi)
             else:
-                doubt = size * min(_SPEED_DOUBT * abs(turned), math.pi)
+                doubt = size * min(math.hypot(_SPEED_DOUBT * turned, bent), math.pi)
             drift = s.voltage_uncertainty * elapsed
             confidence.widen(self._confidence, doubt**2 + drift**2)
             for name in ("pll_started", "pll_omega", "pll_difference"):

@@ -56,7 +56,7 @@ STATE = np.dtype([
     # pulse axis as a unit vector
     ("axis", "c16"),
     ("count", "i8"), ("broken", "i8"), ("started", "i8"),
-    ("i", "c16"), ("first", "c16"), ("flux", "c16"),
+    ("i", "c16"), ("first", "c16"), ("flux", "c16"), ("sum", "c16"),
     # normal equations of the axis and of the bend
     ("axis_normal", "c16", (3, 3)), ("axis_right", "c16", (3,)), ("axis_square", "f8"),
     ("normal", "f8", (_TERMS, _TERMS)), ("right", "f8", (_TERMS,)), ("square", "f8"),
@@ -113,6 +113,7 @@ def window_block(samples: NDArray[np.float64], filled: NDArray[np.uint8], state:
         else:
             st.flux += st.T_s * (v - 0.5 * st.R * (st.i + i)) / st.unit
         st.i = i
+        st.sum += i
         st.broken |= filled[k]
         st.peak = max(st.peak, abs(i))
         st.voltage = max(st.voltage, abs(v))
@@ -165,6 +166,12 @@ def axis(state: NDArray[np.void], noise: float) -> tuple[float, float]:
     if not (math.isfinite(variance) and variance > 0.0 and 1.0 / _ALIEN < abs(b) / model < _ALIEN):
         return 0.0, math.inf
     return 0.5 * cmath.phase(b if st["difference"] < 0.0 else -b), 0.5 * math.sqrt(variance) / model
+
+
+def load(state: NDArray[np.void]) -> float:
+    """Mean current [A peak] of a full window, over whole periods of the pulses: what the drive's control holds."""
+    st = state[0]
+    return abs(complex(st["sum"])) / max(int(st["count"]), 1)
 
 
 def back_emf(state: NDArray[np.void], theta: float, motor: Motor) -> complex:

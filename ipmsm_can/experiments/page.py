@@ -16,7 +16,7 @@ from ipmsm_can.report.palette import DARK, LIGHT, css_variables
 
 _MARKS = {Status.REPRODUCED: "✓", Status.CONDITION: "≈", Status.NOT: "✗"}
 _CLASSES = {Status.REPRODUCED: "good", Status.CONDITION: "half", Status.NOT: "bad"}
-_STYLE = """
+STYLE = """
 *{box-sizing:border-box}
 body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,
 "Helvetica Neue",Arial,sans-serif;-webkit-text-size-adjust:100%;overflow-wrap:break-word}
@@ -82,7 +82,7 @@ def build(results: Results, costs: Mapping[str, float], footer: str) -> str:
             '<meta name="viewport" content="width=device-width,initial-scale=1">'
             '<meta name="color-scheme" content="light dark"><title>The paper, run again – ipmsm-can paper</title>'
             f"<style>:root{{color-scheme:light dark;{css_variables(LIGHT)}}}"
-            f"@media (prefers-color-scheme:dark){{:root{{{css_variables(DARK)}}}}}{_STYLE}</style></head>"
+            f"@media (prefers-color-scheme:dark){{:root{{{css_variables(DARK)}}}}}{STYLE}</style></head>"
             f"<body><main>{''.join(body)}</main></body></html>\n")
 
 

@@ -7,7 +7,7 @@ next DriveTiming settles it.  A DriveSampleBlock carries the whole counter.
 
 What can happen, and what is done:
 
-    lost, at most max_gap       filled by straight lines between the neighbours, marked as filled
+    lost, at most max_gap       and FILLED_S long: filled by straight lines between the neighbours, marked as filled
     lost, more                  `gap` tells the estimator how many are missing: its filters restart
     duplicate                   dropped
     reordered (late)            dropped: its place was filled already
@@ -72,6 +72,9 @@ STATE = np.dtype([
 
 (RECEIVED, FILLED, LOST, DUPLICATES, REORDERED, GAPS, RESYNCS, RESTARTS, BAD_RATE, OVERFLOW,
  CLIPPED_SAMPLES) = range(11)
+FILLED_S = 1.7e-3
+"""Longest loss [s] that is filled, whatever max_gap: a straight line is no path of a vector that turns meanwhile,
+and at 600 rad/s electrical it does by a radian."""
 COUNTERS = ("received", "filled", "lost", "duplicates", "reordered", "gaps", "resyncs", "restarts",
             "bad_rate", "overflow", "clipped")
 
@@ -318,7 +321,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
         gap = 0
         if st.restarted or not st.has_last:
             gap = RESTARTED if st.restarted else 0
-        elif st.correction != 0 or missing > max_gap:
+        elif st.correction != 0 or missing > min(max_gap, st.rate * FILLED_S):
             gap = missing
             if st.correction != 0:
                 gap = -max(abs(st.correction), missing)
@@ -357,7 +360,7 @@ def sequence(begin: int, kind: Ints, counter: Ints, rate: Floats, t_ns: Ints, va
 class SampleSequencer:
     """Sequencing of one drive's samples, with its state and counters.
 
-    max_gap: longest loss, in samples, that is filled by interpolation, 0..64.
+    max_gap: longest loss, in samples, that is filled by interpolation, 0..64, if it is not longer than FILLED_S.
     sample_rate: [Hz], used where the drive sends no DriveTiming, or states nearly the same there; None: samples
     wait for the first one, at most PENDING_MAX of them, and then get the right 32-bit counters in hindsight.
     """

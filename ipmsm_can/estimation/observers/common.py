@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.filters import filter_coefficients
 from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
-from ipmsm_can.estimation.observers.voltage_errors import BIASES, Uncertainty, keeps
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, Uncertainty, corner, keeps
 from ipmsm_can.motor import Motor
 
 _MOST_PERIODS = 16
@@ -37,7 +37,8 @@ PARAMETERS = np.dtype([
     ("pole", "f8"), ("scheduled", "i8"),
     # riccati: 1-sigma of what is uncertain [V], [ohm], share of L_q; states of the voltage's error.
     ("L_d", "f8"), ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
-    ("spread_L", "f8"), ("zone", "f8"), ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
+    ("spread_L", "f8"), ("zone", "f8"), ("corner", "f8"), ("rated", "f8"), ("tilt", "f8"),
+    ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
 ])
 
 STATE = np.dtype([
@@ -121,6 +122,7 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "L_d": motor.L_d, "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor),
         "volts": u.voltage,
         "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
+        "corner": corner(motor), "rated": motor.rated_current, "tilt": u.tilt,
         "prior": u.priors(motor), "keep": keeps(sample_rate),
     }
     for name, value in values.items():

@@ -12,9 +12,15 @@ it is, its derivative along x, the Lambda of `chonam`, is added to Phi.
 Noise, in physical units, nothing tuned.
     process        2 v_r^2 CORRELATION_TIME a second in each direction, v_r: what `voltage_errors` leaves
     y, white       2 alpha psi_m L_q s_i: the current noise through x and H
+    shape          of dead time near zero current: how much a phase loses there is anybody's guess, SHAPE of what it
+                   loses elsewhere.  It is a function of the currents, so it keeps its sign as long as these do: it
+                   counts for a sixth of a radian of the rotor, LONGEST where that takes longer
     y, coloured    2 psi_m v_r, the same voltage error through F.  It keeps its sign for CORRELATION_TIME, so that
                    many samples together say no more than one: its variance counts 2 CORRELATION_TIME/T_s times
     y, transients  2 psi_m dL |H[i]|: a wrong inductance shows while the current changes
+    cross-saturation   under load the axis of the saliency leaves the rotor's by an angle nobody has measured,
+                   `tilt` at rated current and with its square below; 2 psi_m L_0 H[i] times that angle shows in
+                   y, as long as the load lasts.  At speed it is small beside Phi; at standstill it limits probing
     y, memory      after a loss of lock Lemma 1 does not hold until the filters have forgotten: an error of at most
                    4 alpha psi_m^2 that dies out with exp(-alpha t), the paper's epsilon_t, coloured as well
 The angle's 1-sigma is the covariance across x_hat, the current noise L_q s_i, and dL i_q, each over |x_hat|.
@@ -40,13 +46,18 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
-from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, predict
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, near_zero, predict
 from ipmsm_can.estimation.speed import follow
 
 Floats = NDArray[np.float64]
 
 CORRELATION_TIME = 0.01
 """Time [s] over which a voltage error that is no state is taken as constant."""
+SHAPE = 0.25
+"""What a phase near zero current loses, 1-sigma as a share of the dead time's voltage."""
+LONGEST = 0.2
+"""Longest time [s] for which the shape of dead time is taken to keep its sign."""
+_SIXTH = 1.0 / 6.0
 INNOVATION_TIME = 0.005
 """Averaging time [s] of the innovation test."""
 MODEL_ERROR = 0.1
@@ -79,18 +90,23 @@ def carry_over(old: NDArray[np.void], fresh: NDArray[np.void], turned: float, va
         fresh[name] = old[name]
 
 
-def take_angle(state: NDArray[np.void], psi_m: float, x_hat: complex, measured: complex, sigma: float) -> complex:
+def take_angle(state: NDArray[np.void], psi_m: float, prior: Floats, x_hat: complex, measured: complex,
+               sigma: float) -> complex:
     """Take in an active flux measured by its direction, polarity known: as `confidence.take_angle`.
 
-    state: record array (1,) of `common.STATE`; psi_m, x_hat, measured [Wb]; sigma: 1-sigma of the direction [rad
+    state: record array (1,) of `common.STATE`; prior: variances of the voltage errors, float64 (BIASES,); psi_m,
+    x_hat, measured [Wb]; sigma: 1-sigma of the direction [rad
     electrical].  Returns what x_hat has to be put right by [Wb].
     """
     st = state[0]
     P = st["P"]
     north = measured / abs(measured)
     if not st["polarity"]:
+        # What was learned of the voltage with the rotor taken to be elsewhere, by half a turn as a rule, is wrong.
         across2, along2 = (psi_m * sigma) ** 2, (MODEL_ERROR * psi_m) ** 2
-        P[:2, :] = P[:, :2] = 0.0
+        P[:] = 0.0
+        P[2:, 2:] = np.diag(prior)
+        st["bias"] = 0.0
         P[0, 0] = along2 * north.real**2 + across2 * north.imag**2
         P[1, 1] = along2 * north.imag**2 + across2 * north.real**2
         P[0, 1] = P[1, 0] = (along2 - across2) * north.real * north.imag
@@ -261,6 +277,9 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         h_b = regression[6, k]
         i2 = i_a * i_a + i_b * i_b
         residual2 = p.residual * p.residual + p.residual_R * p.residual_R * i2
+        # Dead time as far as it is known: what it is taken for, and what it may be besides.
+        shape2 = SHAPE * SHAPE * (bias[2] * bias[2] + P[4, 4]) * near_zero(i_a, i_b, p.corner)
+        holds = min(max(_SIXTH / max(abs(st.pll_omega), 1e-9), CORRELATION_TIME), LONGEST)
         begins = st.started == 0
         if begins:
             st.started = 1
@@ -276,7 +295,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
                 l_a += T_s * B[j, 0] * bias[j]
                 l_b += T_s * B[j, 1] * bias[j]
                 bias[j] *= p.keep[j]
-            predict(P, B, T_s, p.keep, p.prior, growth * residual2 + tiny)
+            predict(P, B, T_s, p.keep, p.prior, growth * residual2 + 2.0 * holds * T_s * shape2 + tiny)
             _filter_units(B, phi_a, phi_b, st, p)
         st.i_a = i_a
         st.i_b = i_b
@@ -353,9 +372,15 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             h[0] -= ell_alpha * (u_a - (open_ua + p.present * u_a))
             h[1] -= ell_alpha * (u_b - (open_ub + p.present * u_b))
         d2 = p.ell * p.ell * h2 * (0.25 * angle2 * angle2 if known else angle2)
-        coloured = 4.0 * psi_m * psi_m * residual2
+        coloured = 4.0 * psi_m * psi_m * (residual2 + shape2)
+        load_a = i_a - h_a / alpha
+        load_b = i_b - h_b / alpha
+        tilt = p.tilt * (load_a * load_a + load_b * load_b) / (p.rated * p.rated)
+        cross2 = (L_0 * min(tilt, 1.0)) ** 2 * h2
+        coloured += 4.0 * psi_m * psi_m * cross2
+        lasting = 4.0 * psi_m * psi_m * (correlated * residual2 + 2.0 * holds / T_s * (shape2 + cross2))
         rest = white + d2 + 4.0 * psi_m * psi_m * (volts2 + (p.spread_L * L_q) ** 2 * h2) + st.memory
-        seen = _correct(P, h, gain, rest + correlated * coloured)
+        seen = _correct(P, h, gain, rest + lasting)
         misfit = innovation * innovation / (seen + rest + coloured)
         l_a += gain[0] * innovation
         l_b += gain[1] * innovation

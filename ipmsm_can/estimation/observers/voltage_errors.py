@@ -35,6 +35,11 @@ RESIDUAL_SHARE = 0.1
 """What none of the four describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
 _KEEPS = (10.0, 10.0, 10.0, 30.0)
 """Time constants [s]: temperature moves all of them."""
+TILT = 3.0
+"""That angle [rad electrical] over the share by which L_d falls at rated current, as `drive.magnetics` has it."""
+CORNER_SHARE = 0.15
+"""Phase current, as a share of the rated current, up to which the shape of dead time is uncertain: the output
+capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it."""
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 
 
@@ -51,6 +56,12 @@ class Uncertainty:
     inductance: float = 0.06
     adapt_voltage: bool = True
     adapt_resistance: bool = True
+    saturation: float = 0.2
+
+    @property
+    def tilt(self) -> float:
+        """1-sigma [rad electrical] of the angle between the rotor and the axis of saliency at rated current."""
+        return TILT * self.saturation
 
     def priors(self, motor: Motor) -> tuple[float, ...]:
         """Prior variances of the four states [V^2, V^2, V^2, ohm^2]."""
@@ -70,6 +81,11 @@ class Uncertainty:
     def dead_zone(self, motor: Motor) -> float:
         """Phase current [A] below which the sign of a phase's current is not relied on."""
         return max(4.0 * self.current, 0.02 * motor.rated_current)
+
+
+def corner(motor: Motor) -> float:
+    """Phase current [A] up to which the shape of dead time is uncertain."""
+    return CORNER_SHARE * motor.rated_current
 
 
 def keeps(sample_rate: float) -> tuple[float, ...]:
@@ -92,6 +108,19 @@ def directions(i_a: float, i_b: float, zone: float, B: NDArray[np.float64]) -> N
     B[2, 1] = -(phase_b - phase_c) * _HALF_SQRT3 / 1.5
     B[3, 0] = -i_a
     B[3, 1] = -i_b
+
+
+@kernel
+def near_zero(i_a: float, i_b: float, corner: float) -> float:
+    """Square of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
+
+    A phase's share falls from 1 at zero current to 0 at `corner` [A]; the phases' errors are independent.
+    """
+    total = 0.0
+    for phase in (i_a, -0.5 * i_a + _HALF_SQRT3 * i_b, -0.5 * i_a - _HALF_SQRT3 * i_b):
+        share = max(0.0, 1.0 - abs(phase) / corner)
+        total += share * share
+    return 4.0 / 9.0 * total
 
 
 @kernel

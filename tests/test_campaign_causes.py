@@ -1,0 +1,94 @@
+"""What the campaign found while an angle was valid and wrong, each cause by itself."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from ipmsm_can.config import parse_config
+from ipmsm_can.config.build import estimator_settings
+from ipmsm_can.drive.profile import Profile
+from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
+from ipmsm_can.estimation import confidence
+from ipmsm_can.estimation.estimator import Estimator
+from ipmsm_can.estimation.observers import common, riccati, voltage_errors
+from ipmsm_can.motor import M2
+from ipmsm_can.startup import _Turning
+from ipmsm_can.wire.sequence import FILLED_S, NIBBLE, TIMING, Events, SampleSequencer
+
+RATE = 5000.0
+
+
+def test_what_was_learned_of_the_voltage_at_the_wrong_end_is_forgotten() -> None:
+    """The polarity turned out to be the other one: the voltage errors found with it were its excuse."""
+    state = common.new_state(0.0, 0.0, 0.0)
+    state["P"][0] = 1e-6 * np.eye(6)
+    state["bias"][0] = 0.1, -0.2, 0.9, 0.3
+    prior = np.array([0.01, 0.01, 0.25, 0.02])
+    riccati.take_angle(state, 0.59, prior, -0.59 + 0j, 0.59 + 0j, 0.05)
+    assert np.array_equal(state["bias"][0], np.zeros(4))
+    assert np.array_equal(state["P"][0][2:, 2:], np.diag(prior))
+    assert not state["P"][0][:2, 2:].any()
+    assert state["P"][0][1, 1] == pytest.approx((0.59 * 0.05) ** 2)
+
+
+def test_the_shape_of_dead_time_counts_for_phases_near_zero_current() -> None:
+    """Against the phase currents of the Clarke transformation; nothing is left once all of them are large."""
+    for angle in np.linspace(0.0, 2.0 * math.pi, 13):
+        i = 0.7 * np.exp(1j * angle)
+        phases = np.real(i * np.exp(-2j * math.pi / 3.0 * np.arange(3)))
+        shares = np.maximum(0.0, 1.0 - np.abs(phases) / 0.5)
+        assert voltage_errors.near_zero(i.real, i.imag, 0.5) == pytest.approx(4.0 / 9.0 * (shares**2).sum())
+    assert voltage_errors.near_zero(5.0, 2.0, 0.5) == 0.0
+    assert voltage_errors.near_zero(0.0, 0.0, 0.5) == pytest.approx(4.0 / 3.0)
+
+
+def test_a_rotor_that_turns_while_it_is_looked_at_is_where_it_is_now() -> None:
+    rng = np.random.default_rng(6)
+    off = []
+    for _ in range(200):
+        turning = _Turning()
+        noise = 0.02 * rng.standard_normal(12)
+        for k in range(12):
+            turning.add(0.4 if k == 0 else 9.9, math.remainder(0.4 + 0.03 * k + noise[k], math.pi), 0.02)
+        angle, sigma = turning.now
+        off.append(angle - (0.4 + 0.03 * 11.5 - 0.0))
+    assert abs(np.mean(off)) < 0.01, "no lag behind the ramp"
+    assert np.std(off) < sigma < 3.0 * 0.02
+    few = _Turning()
+    few.add(0.0, 0.1, 0.02)
+    few.add(0.0, 0.1, 0.02)
+    assert few.now[1] == math.inf
+
+
+def test_an_acceleration_that_ends_in_a_gap_is_allowed_for() -> None:
+    """The rotor brakes hard, then 60 ms are missing in which the braking ends: sigma covers where it then is."""
+    track = Profile(((0.0, 40.0), (0.5, 40.0), (0.6, 0.0), (1.0, 0.0)), ((0.0, 0.0),), 1.0)
+    s = DriveSimulation(M2, DriveParameters(sample_rate=RATE, speed_imposed=True), track, 0.3).run(5000)
+    samples = np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+    keep, gap = np.ones(5000, np.bool_), np.zeros(5000, np.int64)
+    keep[2950:3250], gap[3250] = False, 300
+    config = parse_config('[motor]\npreset = "m2"\n[observer]\nkind = "riccati"\n')
+    out = Estimator(M2, RATE, estimator_settings(config)).process(np.ascontiguousarray(samples[:, keep]), gap[keep])
+    first = int(np.flatnonzero(gap[keep])[0])
+    error = abs(math.remainder(out.angle[0, first] - s.theta_e[keep][first], 2.0 * math.pi))
+    assert out.flags[first - 1] & confidence.VALID
+    assert error > math.radians(15.0), "else it shows nothing"
+    assert error < 2.0 * out.sigma[first]
+    assert not out.flags[first] & confidence.VALID
+
+
+@pytest.mark.parametrize(("rate", "lost", "filled"), [(2500.0, 4, True), (2500.0, 5, False), (5000.0, 8, True),
+                                                      (10_000.0, 8, True)])
+def test_a_loss_is_filled_only_while_a_line_is_a_path(rate: float, lost: int, filled: bool) -> None:
+    sequencer = SampleSequencer(8)
+    counters = [0, 1, 2, 3 + lost, 4 + lost]
+    kind = np.array([TIMING, *[NIBBLE] * 5])
+    counter = np.array([0, *(c & 15 for c in counters)], np.int64)
+    t_ns = np.array([0, *(round(c * 1e9 / rate) for c in counters)], np.int64)
+    runs = sequencer.push(Events(kind, counter, np.array([rate, *[0.0] * 5]), t_ns, np.zeros((4, 6))))
+    assert sum(int(r.filled.sum()) for r in runs) == (lost if filled else 0)
+    assert max(int(r.gap.max()) for r in runs) == (0 if filled else lost)
+    assert lost / rate < FILLED_S or not filled
