@@ -214,7 +214,10 @@ class StartUp:
                 self._to(Phase.AXIS)
             return
         theta, sigma = polarity.axis(self._window, self._noise)
-        tilt = self._tilt * (polarity.load(self._window) / self._motor.rated_current) ** 2
+        # What the iron is driven with along d turns the axis as much as what loads it across.
+        load = polarity.load(self._window)
+        driven = max(load, float(self._window["peak"][0])) if self.phase is Phase.PULSES else load
+        tilt = self._tilt * load * driven / self._motor.rated_current**2
         sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, self._turned / max(float(self._window["voltage"][0]), 1e-9))
         broken = bool(self._window["broken"][0])
         if not broken:

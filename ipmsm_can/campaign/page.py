@@ -39,7 +39,7 @@ def build(summary: Record, records: Sequence[Record], command: str) -> str:
             f"the simulated drive, its frames and the companion with the observer <b>{escape(plan['kind'])}</b>; "
             f"seed {plan['seed']}. Angles are electrical.</p><p><b>{tally}</b> {told}The angle was valid for "
             f"{summary['seconds_valid']:.0f} s, {summary['estimates_valid']} of {summary['estimates']} estimates; "
-            f"in {summary['never_valid']} runs it never was.</p>{_by_limit(summary)}{_troubles(summary)}")
+            f"in {summary['never_valid']} runs it never was.</p>{_by_machine(summary)}{_troubles(summary)}")
     plots = [p for p in (
         _pooled(summary), _ratio(summary),
         _over_runs("Largest error while valid, run by run", "largest error, ° electrical", "share of the runs",
@@ -73,9 +73,9 @@ def _share(value: float) -> str:
     return f"{100.0 * value:.2f} %"
 
 
-def _by_limit(summary: Record) -> str:
-    parts = "; ".join(f"{limit}°: {n['wrong']} of {n['runs']}" for limit, n in summary["by_valid_sigma"].items())
-    return f'<p class="note">Runs wrong, by the largest 1-sigma that was allowed to be valid: {parts}.</p>'
+def _by_machine(summary: Record) -> str:
+    parts = "; ".join(f"{name}: {n['wrong']} of {n['runs']}" for name, n in summary["by_machine"].items())
+    return f'<p class="note">Runs wrong, by the magnetics of the machine: {parts}.</p>'
 
 
 def _troubles(summary: Record) -> str:

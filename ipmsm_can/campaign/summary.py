@@ -32,9 +32,9 @@ def summarise(records: Sequence[Record], plan: Record) -> dict[str, Any]:
         "campaign": plan,
         "runs": len(records), "never_valid": len(finished) - len(claimed),
         "wrong": [r["number"] for r in records if r["wrong"]],
-        "by_valid_sigma": {f"{limit:g}": {"runs": sum(r["valid_sigma"] == limit for r in finished),
-                                          "wrong": sum(r["valid_sigma"] == limit and r["wrong"] for r in finished)}
-                           for limit in sorted({r["valid_sigma"] for r in finished})},
+        "by_machine": {name: {"runs": sum((r["saturation"] > 0.0) == soft for r in finished),
+                              "wrong": sum((r["saturation"] > 0.0) == soft and r["wrong"] for r in finished)}
+                       for name, soft in (("linear", False), ("saturating", True))},
         "exceptions": {str(r["number"]): r["exception"] for r in records if r["exception"] is not None},
         "not_finite": [r["number"] for r in finished if r["not_finite"]],
         "limit_deg": WRONG_DEG,

@@ -106,9 +106,8 @@ def _report(summary: dict[str, Any], out: Path, seconds: float) -> None:
           + (f"{100 * within:.2f} % of the errors within 2 sigma; " if within is not None else "")
           + f"valid for {summary['seconds_valid']:.0f} s; {seconds:.0f} s.\n"
             f"  page: {out / 'campaign.html'}\n  data: {out / 'summary.json'}, {out / 'runs.jsonl'}")
-    limits = "; ".join(f"{limit} deg: {n['wrong']} of {n['runs']}"
-                       for limit, n in summary["by_valid_sigma"].items())
-    print(f"wrong by the largest 1-sigma allowed (valid_sigma): {limits}")
+    machines = "; ".join(f"{name}: {n['wrong']} of {n['runs']}" for name, n in summary["by_machine"].items())
+    print(f"wrong by the magnetics of the machine: {machines}")
     for number in wrong:
         print(f"valid and wrong: run {number} (ipmsm-can campaign --seed {plan['seed']} --kind {plan['kind']} "
               f"--only {number})")

@@ -215,8 +215,8 @@ class EstimateConfig(Section):
         doc="CompanionStatus messages per second.", unit=units.HERTZ, least=1, most=1e3)] = 10.0
     valid_sigma: Annotated[float, Quantity(
         doc="An angle whose 1-sigma uncertainty is larger is never called valid (electrical). An error "
-            "of three of them is rare: 5 deg stands for 15 deg at most.",
-        unit=units.DEGREE, above=0, most=90)] = 10.0
+            "of two of them is rare, of three very rare: 5 deg stands for 15 deg at most.",
+        unit=units.DEGREE, above=0, most=90)] = 7.5
 
 
 class InjectionConfig(Section):

@@ -30,6 +30,8 @@ That is the theory of `ges`; of the other observers it describes
     chonam                the error along Phi; Lambda is taken as |l| |H[i]|/|x_hat| in an unknown direction, so a
                           correction spreads that much in every direction
     riccati               nothing: it brings its own covariance, innovation test and polarity (`observers.riccati`).
+                          An observer that loses its lock again and again does not describe the machine, and its
+                          covariance cannot be believed: each loss keeps `valid` off for longer
                           Added here is whether the speed is plausible: |Phi| against that of a rotor that turns as
                           fast as the angle does
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
@@ -63,6 +65,12 @@ _LOST_ABOVE = 9.0
 _SIGMA_HYSTERESIS = 1.5
 _POLARITY_SIGMA = math.radians(45.0)
 _UNKNOWN_AXIS = math.pi / 2.0
+_PROBATION = 0.1
+"""Time [s] after a loss of lock in which no angle is valid; twice as long for each further one that is not yet
+forgotten, at most _LONGEST_PROBATION."""
+_LONGEST_PROBATION = 3.2
+_FORGIVEN = 1.0
+"""Time [s] after which one loss of lock is forgotten."""
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
@@ -79,6 +87,8 @@ STATE = np.dtype([
     ("own", "i8"), ("L_0", "f8"), ("volts", "f8"),
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
+    # riccati: losses of lock that are not yet forgotten, and for how long [s] nothing is valid.
+    ("losses", "f8"), ("probation", "f8"),
 ])
 
 
@@ -205,6 +215,8 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     st.started = 1
     locked = st.locked
     lost = st.lost
+    losses = st.losses
+    probation = st.probation
     for k in range(flux.shape[1]):
         s = flux[5, k]
         opinion = int(flux[6, k])
@@ -218,21 +230,27 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             off = 100.0
         test += smoothing * (off - test)
         fits = opinion & FITS and test < 1.0
+        losses = max(losses - st.T_s / _FORGIVEN, 0.0)
+        probation = max(probation - st.T_s, 0.0)
         if locked:
             if not fits:
                 lost += 1
                 locked = 0
+                probation = min(_PROBATION * 2.0**losses, _LONGEST_PROBATION)
+                losses += 1.0
             elif s > _SIGMA_HYSTERESIS * st.sigma_limit:
                 locked = 0
         elif fits and s < st.sigma_limit:
             locked = 1
         polarity = 1 if opinion & POLARITY else 0
         sigma[k] = s
-        valid = locked and polarity and s <= st.sigma_limit
+        valid = locked and polarity and s <= st.sigma_limit and probation == 0.0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
     st.test = test
     st.locked = locked
     st.lost = lost
+    st.losses = losses
+    st.probation = probation
 
 
 @kernel
