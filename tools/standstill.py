@@ -145,7 +145,9 @@ def judge(case: Case, results: Sequence[Result]) -> tuple[str, bool]:
     """A line of the table, and whether the target holds."""
     n = len(results)
     refused = sum(r.phase is Phase.REFUSED and r.valid_at == math.inf for r in results)
-    right = sum(r.valid and r.error < 5.0 and r.wrong < 15.0 for r in results)
+    # Where samples are missing, sigma may be above its limit at the very end.
+    started = [r.valid if case.faults == CLEAN else math.isfinite(r.valid_at) for r in results]
+    right = sum(s and r.error < 5.0 and r.wrong < 15.0 for s, r in zip(started, results, strict=True))
     false_claims = sum(r.wrong >= 15.0 for r in results)
     limits = all(r.moved < 5.0 and r.probing <= 0.15 and r.pulses <= 1.0 for r in results)
     good = (refused if case.saturation == 0.0 else right) == n and false_claims == 0 and limits
