@@ -31,24 +31,30 @@ def shipped_maps() -> dict[str, Path]:
     return {path.stem: path for path in sorted(map_folder().glob("*.toml"))}
 
 
+def map_path(map_or_path: str | Path) -> Path:
+    """The path itself, or that of the shipped map of this name.  Raises MapError where there is neither."""
+    path = Path(map_or_path)
+    if path.is_file() or path.name != str(map_or_path) or path.suffix:
+        return path
+    shipped = shipped_maps()
+    if path.name not in shipped:
+        guess = nearest_word(path.name, list(shipped))
+        hint = f"did you mean {guess}? " if guess else ""
+        raise MapError(f"{path}: there is neither such a file nor a shipped map of this name; {hint}"
+                       f"shipped are {', '.join(shipped)}")
+    return shipped[path.name]
+
+
 def load_map(map_or_path: str | Path) -> InverterMap:
     """The map in a TOML file, or the shipped one of this name; paths in it are relative to its folder.
 
     Raises MapError.
     """
-    path = Path(map_or_path)
-    shipped = shipped_maps()
-    if not path.exists() and path.name == str(map_or_path) and not path.suffix:
-        if path.name not in shipped:
-            guess = nearest_word(path.name, list(shipped))
-            hint = f"did you mean {guess}? " if guess else ""
-            raise MapError(f"{path}: there is neither such a file nor a shipped map of this name; {hint}"
-                           f"shipped are {', '.join(shipped)}")
-        path = shipped[path.name]
+    path = map_path(map_or_path)
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except FileNotFoundError:
-        raise MapError(f"{path}: there is no such file; shipped maps are {', '.join(shipped)}") from None
+        raise MapError(f"{path}: there is no such file; shipped maps are {', '.join(shipped_maps())}") from None
     except OSError as error:
         raise MapError(f"{path}: the file cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

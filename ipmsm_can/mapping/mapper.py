@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,11 +74,14 @@ class Mapper:
     """The mapping of one drive, with its state.  Any partition of the same frames gives the same bits.
 
     plan: what is decoded, from `make_plan`.  rate: samples per second where the caller knows better than the map.
+    listener: is shown what every frame reports, t_ns (M,) and values (CHANNELS, M) with NaN where there is none.
     frames: how many frames of each message (in the order of plan.sources) came; foreign: of other identifiers.
     """
 
-    def __init__(self, plan: Plan, rate: float | None = None) -> None:
+    def __init__(self, plan: Plan, rate: float | None = None,
+                 listener: Callable[[Ints, Floats], None] | None = None) -> None:
         self.plan = plan
+        self._listener = listener
         self.frames = np.zeros(len(plan.sources), np.int64)
         self.foreign = 0
         inverter = plan.map
@@ -129,7 +132,10 @@ class Mapper:
             values = s.codec.decode_rows(words, picked[here])
             for row, channel in zip(s.rows.tolist(), s.channels, strict=True):
                 frames[channel.number, here] = channel.gain * values[row] + channel.offset
-        return self._rows(block.t_ns[picked], frames, at_end=False)
+        t_ns = block.t_ns[picked]
+        if self._listener is not None:
+            self._listener(t_ns, frames)
+        return self._rows(t_ns, frames, at_end=False)
 
     def flush(self) -> MappedBlock:
         """The rest, when no more frames will come: samples whose later reports are missing."""

@@ -116,6 +116,9 @@ class VoltageMap(Section):
         doc="How many samples late the voltage is: 0 where it is the mean of the interval that ended at the "
             "sample, 1 where it is that of the interval before; -1 where it is the one that begins there.",
         unit=units.SAMPLES, least=-2, most=2)] = 0.0
+    mean: Annotated[bool, Switch(
+        doc="Whether it is the mean of a whole interval between two samples, as the fast observer needs it; false "
+            "where it is a momentary value.")] = True
     a: Annotated[SignalRef | None, SignalKey(doc="Voltage or duty cycle (0 to 1) of phase a.")] = None
     b: Annotated[SignalRef | None, SignalKey(doc="The same of phase b.")] = None
     c: Annotated[SignalRef | None, SignalKey(doc="The same of phase c.")] = None
