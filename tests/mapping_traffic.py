@@ -39,7 +39,8 @@ class Truth:
 
     def v_dq(self, t: Floats) -> Floats:
         i, w = self.i_dq(t), self.omega(t)
-        return (self.r * i.real - w * self.l_q * i.imag) + 1j * (self.r * i.imag + w * (self.l_d * i.real + self.psi_m))
+        v_d, v_q = self.r * i.real - w * self.l_q * i.imag, self.r * i.imag + w * (self.l_d * i.real + self.psi_m)
+        return v_d + 1j * v_q
 
     def i(self, t: Floats) -> Floats:
         return self.i_dq(t) * np.exp(1j * self.theta(t))
@@ -62,7 +63,7 @@ def frames(dbc: Path | str, sent: Mapping[str, tuple[Floats, Mapping[str, object
         message = database.get_message_by_name(name)
         rows = FrameBlock(np.zeros((len(times), 72), np.uint8), T0 + np.rint(1e9 * times).astype(np.int64))
         for k in range(len(times)):
-            values = {s: (v[k] if isinstance(v, np.ndarray) else v) for s, v in signals.items()}
+            values = {s: (float(v[k]) if isinstance(v, np.ndarray) else v) for s, v in signals.items()}
             rest = {s.name: 0 for s in message.signals if s.name not in values}
             data = message.encode({**rest, **values}, strict=False)
             rows.data[k, :len(data)] = list(data)

@@ -190,6 +190,6 @@ class Survey:
         dt = 1e-9 * np.diff(b.t_ns, prepend=before[0])
         turned = (np.diff(theta, prepend=before[1]) + math.pi) % (2.0 * math.pi) - math.pi
         expected = b.omega_e * dt
-        good = np.isfinite(turned) & (np.abs(expected) < _SLOPE_BELOW) & (dt > 0.0) & (np.abs(turned) < 2.0)
+        good = np.isfinite(turned) & (np.abs(expected) < _SLOPE_BELOW) & (dt > 0.0)
         self._slope += (float(turned[good] @ expected[good]), float(expected[good] @ expected[good]))
         self._last = (int(b.t_ns[-1]), float(theta[-1]))
