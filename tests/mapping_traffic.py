@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cantools.database
 import numpy as np
@@ -29,24 +30,24 @@ class Truth:
     l_q: float = 12.9e-3
 
     def omega(self, t: Floats) -> Floats:
-        return 2 * math.pi * self.hertz * np.ones_like(t)
+        return np.full(t.shape, 2 * math.pi * self.hertz)
 
     def theta(self, t: Floats) -> Floats:
-        return 0.4 + 2 * math.pi * self.hertz * t
+        return np.asarray(0.4 + 2 * math.pi * self.hertz * t)
 
     def i_dq(self, t: Floats) -> Floats:
-        return -1.5 + 0.2 * t + 1j * (6.0 + 0.5 * t)
+        return np.asarray(-1.5 + 0.2 * t + 1j * (6.0 + 0.5 * t))
 
     def v_dq(self, t: Floats) -> Floats:
         i, w = self.i_dq(t), self.omega(t)
         v_d, v_q = self.r * i.real - w * self.l_q * i.imag, self.r * i.imag + w * (self.l_d * i.real + self.psi_m)
-        return v_d + 1j * v_q
+        return np.asarray(v_d + 1j * v_q)
 
     def i(self, t: Floats) -> Floats:
-        return self.i_dq(t) * np.exp(1j * self.theta(t))
+        return np.asarray(self.i_dq(t) * np.exp(1j * self.theta(t)))
 
     def v(self, t: Floats) -> Floats:
-        return self.v_dq(t) * np.exp(1j * self.theta(t))
+        return np.asarray(self.v_dq(t) * np.exp(1j * self.theta(t)))
 
     def phases(self, vector: Floats) -> list[Floats]:
         """a, b, c of a vector, by projection on the phases' axes."""
@@ -58,12 +59,14 @@ def frames(dbc: Path | str, sent: Mapping[str, tuple[Floats, Mapping[str, object
     shift: added to every identifier."""
     database = (cantools.database.load_file(dbc) if isinstance(dbc, Path) else
                 cantools.database.load_string(dbc, "dbc"))
+    assert isinstance(database, cantools.database.can.Database)
     parts = []
     for name, (times, signals) in sent.items():
         message = database.get_message_by_name(name)
         rows = FrameBlock(np.zeros((len(times), 72), np.uint8), T0 + np.rint(1e9 * times).astype(np.int64))
         for k in range(len(times)):
-            values = {s: (float(v[k]) if isinstance(v, np.ndarray) else v) for s, v in signals.items()}
+            values: dict[str, Any] = {
+                s: (float(v[k]) if isinstance(v, np.ndarray) else v) for s, v in signals.items()}
             rest = {s.name: 0 for s in message.signals if s.name not in values}
             data = message.encode({**rest, **values}, strict=False)
             rows.data[k, :len(data)] = list(data)

@@ -51,6 +51,7 @@ def test_check_tells_rates_distances_and_what_can_be_done(car: str, capsys: Capt
     assert re.search(r"fast observer +no +the voltage is a momentary value", shown)
     assert re.search(r"steady-state checks +yes", shown)
     assert re.search(r"bus statistics +yes", shown)
+    assert "320 to 320 V" in _line(shown, "dc_voltage.signal")
     assert "missing" not in shown.split("what it allows")[0].replace("values missing", "")
 
 
@@ -85,7 +86,7 @@ def test_a_wrong_direction_shows(tmp_path: Path, car: str, capsys: Capture) -> N
     map_text = shipped_maps()["cascadia_pm"].read_text()
     for change, told in ((("direction = 1", "direction = -1"), "the angle runs against the speed"),
                          (('of = "electrical"', 'of = "shaft"'), "the angle turns 4.00 times as fast"),
-                         (('measure = "peak"                # assumed', 'measure = "rms"'), "")):
+                         (('measure = "peak"                # assumed', 'measure = "rms" # assumed'), "")):
         (tmp_path / "x.toml").write_text(map_text.replace(*change))
         assert main(["map", "--check", car, str(tmp_path / "x.toml"), "--pole-pairs", "4"]) == 0
         shown = capsys.readouterr().out

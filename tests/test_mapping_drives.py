@@ -11,7 +11,7 @@ import pytest
 
 from ipmsm_can.frames import CAN_EFF_FLAG, FrameBlock
 from ipmsm_can.mapping import MappedBlock, load_map, mapped
-from ipmsm_can.mapping.convert import ANGLE_APART, CURRENT_APART, VOLTAGE_APART
+from ipmsm_can.mapping.convert import ANGLE_APART, CURRENT_APART, VOLTAGE_APART, spoils_dq
 from ipmsm_can.mapping.load import map_folder
 from ipmsm_can.wire.protocol import Protocol
 from ipmsm_can.wire.receive import SampleReceiver
@@ -54,6 +54,7 @@ def cascadia(hertz: float = 12.0, seconds: float = 1.0, lag: float = 2e-4) -> Fr
         "PM_A6_Currents": (t + lag, {"i_a": a, "i_b": b, "i_c": c, "i_dc": 3.0}),
         "PM_A7_Voltages": (t + 2 * lag, {"v_dc": 320.0, "v_out": np.abs(v), "v_ab_or_v_d": v.real,
                                          "v_bc_or_v_q": v.imag}),
+        "PM_A8_Flux": (t + 3 * lag, {"i_d": truth.i_dq(t + 3 * lag).real, "i_q": truth.i_dq(t + 3 * lag).imag}),
         "PM_B0_Fast": (fast, {"torque_feedback": 1.5 * PAIRS * 0.59 * i.imag, "v_dc": 320.0})})
 
 
@@ -78,6 +79,17 @@ def test_cascadia_turning_fast_is_said_to_be_too_far_apart() -> None:
     assert not (found.quality & (CURRENT_APART | VOLTAGE_APART)).any()  # dq voltages do not turn
     # Between two reports it turned one and a half times; the speed says so.
     assert _degrees_off(found.theta_e[1:-1], Truth(150.0).theta(_seconds(found))[1:-1]) < 1.0
+
+
+def test_cascadia_in_d_and_q_does_not_mind_the_angle() -> None:
+    truth = Truth(150.0)
+    found = run(cascadia(hertz=150.0), load_map("cascadia_pm_dq"))
+    t = _seconds(found)
+    assert np.abs(found.i_d + 1j * found.i_q - truth.i_dq(t)).max() < 0.075
+    assert np.abs(found.v_d + 1j * found.v_q - truth.v_dq(t))[1:].max() < 0.08
+    assert (found.quality & ANGLE_APART != 0).all()
+    assert not (found.quality & spoils_dq(load_map("cascadia_pm_dq"))).any()
+    assert spoils_dq(load_map("cascadia_pm")) & ANGLE_APART
 
 
 def test_cascadia_by_hand() -> None:

@@ -69,6 +69,7 @@ def test_paths_nodes_and_the_dbc(tmp_path: Path) -> None:
 
 
 def test_shipped_maps_load_and_fit_their_dbc() -> None:
-    assert list(shipped_maps()) == ["cascadia_pm", "ipmsm_can", "moteus", "odrive", "openinverter", "vesc"]
+    assert list(shipped_maps()) == [
+        "cascadia_pm", "cascadia_pm_dq", "ipmsm_can", "moteus", "odrive", "openinverter", "vesc"]
     for name in shipped_maps():
         assert make_plan(load_map(name), pole_pairs=4).channels

@@ -55,8 +55,8 @@ def replay_mapped(args: argparse.Namespace) -> int:
         _track(config, plan, survey.rate, reader, out)
     else:
         if not steady.able:
-            raise ValueError(f"{args.log} with the map {args.map} allows neither the fast observer ({fast.why}) nor "
-                             f"steady-state checks ({steady.why})")
+            raise ValueError(f"{args.log} with the map {args.map} allows neither the fast observer ({fast.why}) "
+                             f"nor steady-state checks ({steady.why})")
         print(f"no fast observer: {fast.why}")
         _steady(config, plan, survey.rate, reader, out)
     if reader.problem or reader.bad_lines:
@@ -123,7 +123,7 @@ def _steady(config: DriveConfig, plan: Plan, rate: float, reader: Any, out: Path
 
     if out is not None and out.suffix != ".csv":
         raise ValueError(f"--out is {out}; steady-state quantities are written as .csv only")
-    state = SteadyState(config.build_motor())
+    state = SteadyState(config.build_motor(), plan.map)
     if out is None:
         for block in _blocks(plan, rate, reader):
             state.feed(block)

@@ -7,19 +7,7 @@ from dataclasses import dataclass
 
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK
 from ipmsm_can.mapping.convert import QUALITY
-from ipmsm_can.mapping.plan import (
-    ANGLE,
-    CONSTANT,
-    COUNTER,
-    ENCODER,
-    OMEGA,
-    RATE,
-    TEMPERATURE,
-    TORQUE,
-    V_0,
-    V_DC,
-    Channel,
-)
+from ipmsm_can.mapping.plan import CONSTANT, COUNTER, OMEGA, RATE, Channel
 from ipmsm_can.mapping.survey import SignalFigures, Survey
 from ipmsm_can.wire.sequence import RATE_MIN
 
@@ -33,10 +21,6 @@ _NEARLY = 0.99
 """A rate found from arrival times is never quite the one that is meant."""
 _SHARE_NEEDED = 0.5
 _IDS_SHOWN = 12
-
-_UNIT = {ANGLE: "deg", ENCODER: "deg", OMEGA: "Hz electrical", V_DC: "V", TORQUE: "N m", TEMPERATURE: "degC",
-         COUNTER: "", RATE: "Hz"}
-_SCALE = {ANGLE: 180.0 / math.pi, ENCODER: 180.0 / math.pi, OMEGA: 0.5 / math.pi}
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,8 +106,8 @@ def _fast(survey: Survey) -> Ability:
     if lacks:
         return Ability(name, False, f"the map has not {' and not '.join(lacks)} of the motor")
     if survey.plan.map.voltage is not None and not survey.plan.map.voltage.mean:
-        return Ability(name, False, "the voltage is a momentary value, not the mean of the interval between samples "
-                       "(voltage.mean)")
+        return Ability(name, False, "the voltage is a momentary value, not the mean of the interval between "
+                       "samples (voltage.mean)")
     slow = fast_enough(survey)
     if slow:
         return Ability(name, False, slow)
@@ -154,7 +138,7 @@ def _steady(survey: Survey) -> Ability:
         return Ability(name, False, f"the map has not {' and not '.join(lacks)}{rest}")
     if survey.dq < _SHARE_NEEDED * survey.rows or not survey.rows:
         return Ability(name, False, f"only {_share(survey.dq, survey.rows)} of the samples have current, voltage "
-                       "and speed in the rotor's frame")
+                       "and speed in the rotor's frame, reported near enough in time")
     return Ability(name, True, f"{survey.dq} samples with current, voltage and speed in the rotor's frame")
 
 
@@ -225,17 +209,11 @@ def _figures(c: Channel, s: SignalFigures, survey: Survey) -> str:
 
 
 def _number(c: Channel, value: float) -> str:
-    return f"{value * _SCALE.get(c.number, 1.0):.4g}"
+    return f"{value * c.scale:.4g}"
 
 
 def _value(c: Channel, value: float) -> str:
-    if c.number < V_0:
-        unit = "A"
-    elif c.number < ANGLE:
-        unit = ""  # volts or duty cycles, as the map says
-    else:
-        unit = _UNIT[c.number]
-    return f"{_number(c, value)} {unit}".rstrip()
+    return f"{_number(c, value)} {c.unit}".rstrip()
 
 
 def _share(part: int, whole: int) -> str:

@@ -57,6 +57,13 @@ def settings(inverter: InverterMap, how: Ints) -> Records:
     return out
 
 
+def spoils_dq(inverter: InverterMap) -> int:
+    """The bits of quality that make i_d, i_q, v_d and v_q doubtful: the angle's only where it was used for them."""
+    forms = [part.form for part in (inverter.current, inverter.voltage) if part is not None]
+    angle = ANGLE_APART if any(form != "dq" for form in forms) else 0
+    return CURRENT_APART | VOLTAGE_APART | IMPLAUSIBLE | angle
+
+
 def _factor(section: CurrentMap | VoltageMap) -> float:
     """From the numbers on the bus to peak, per phase, amplitude-invariant."""
     vector = section.form in ("alpha_beta", "dq")

@@ -31,11 +31,16 @@ ABSENT, INTERPOLATE, HOLD, CIRCLE, CONSTANT = range(5)
 _TURN = {"deg": math.pi / 180.0, "rad": 1.0, "turns": 2.0 * math.pi}
 _SPEED = {"rad/s": 1.0, "Hz": 2.0 * math.pi, "rpm": 2.0 * math.pi / 60.0, "turns/s": 2.0 * math.pi}
 
+_SHOWN = {ANGLE: 180.0 / math.pi, ENCODER: 180.0 / math.pi, OMEGA: 0.5 / math.pi}
+
 
 @dataclass(frozen=True, slots=True)
 class Channel:
     """One value of the map.  key: where it stands in the map, "current.a".  value = gain * DBC value + offset, in
-    A, V, rad electrical, rad/s electrical, N m, degC; how: INTERPOLATE, HOLD, CIRCLE or CONSTANT."""
+    A, V, rad electrical, rad/s electrical, N m, degC; how: INTERPOLATE, HOLD, CIRCLE or CONSTANT.
+
+    unit, scale: what to show it in, and the factor into that.
+    """
 
     number: int
     key: str
@@ -43,6 +48,8 @@ class Channel:
     how: int
     gain: float
     offset: float
+    unit: str = ""
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,17 +121,22 @@ def make_plan(inverter: InverterMap, *, node: int | None = None, pole_pairs: int
 
 def _channels(inverter: InverterMap, pole_pairs: int) -> list[Channel]:
     found: list[Channel] = []
+    duty = inverter.voltage is not None and inverter.voltage.form == "duty"
+    units = {**dict.fromkeys((I_0, I_1, I_2), "A"), **dict.fromkeys((V_0, V_1, V_2), "" if duty else "V"),
+             ANGLE: "deg", ENCODER: "deg", OMEGA: "Hz electrical", V_DC: "V", TORQUE: "N m", TEMPERATURE: "degC",
+             COUNTER: "", RATE: "Hz"}
 
     def add(number: int, key: str, ref: SignalRef | None, factor: float = 1.0, offset: float = 0.0,
             how: int = INTERPOLATE) -> None:
         if ref is None:
             return
         if ref.is_constant:
-            found.append(Channel(number, key, ref, CONSTANT, 0.0, ref.constant * factor + offset))
+            found.append(Channel(number, key, ref, CONSTANT, 0.0, ref.constant * factor + offset, units[number],
+                                 _SHOWN.get(number, 1.0)))
             return
         how = HOLD if ref.method == "hold" else how
         found.append(Channel(number, key, ref, how, ref.sign * ref.gain * factor,
-                             ref.sign * ref.offset * factor + offset))
+                             ref.sign * ref.offset * factor + offset, units[number], _SHOWN.get(number, 1.0)))
 
     def add_angle(number: int, name: str, part: AngleMap | None) -> None:
         if part is not None:

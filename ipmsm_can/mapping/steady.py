@@ -12,7 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.mapping.convert import spoils_dq
 from ipmsm_can.mapping.mapper import MappedBlock
+from ipmsm_can.mapping.model import InverterMap
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -64,8 +66,9 @@ class SteadyState:
     rows, steady: samples, and those that were steady and fast enough to judge by.
     """
 
-    def __init__(self, motor: Motor) -> None:
+    def __init__(self, motor: Motor, inverter: InverterMap) -> None:
         self.motor = motor
+        self._spoils = spoils_dq(inverter)
         self.rows = self.steady = 0
         self.psi_m, self.v_d_rest, self.power, self.torque_rest = Mean(), Mean(), Mean(), Mean()
         self._before = np.full(3, np.nan)
@@ -84,7 +87,7 @@ class SteadyState:
         steady = (step[0] <= small) & (step[1] <= small) & (step[2] <= STEADY_SPEED * np.abs(w))
         # Below this the resistance and the dead time decide, not the magnets.
         steady &= np.abs(w) * m.psi_m > np.maximum(m.R * np.hypot(b.i_d, b.i_q), 2.0)
-        steady &= b.quality == 0
+        steady &= b.quality & self._spoils == 0
         with np.errstate(divide="ignore", invalid="ignore"):
             psi = np.where(steady, (b.v_q - m.R * b.i_q) / w - m.L_d * b.i_d, np.nan)
         rest = np.where(steady, b.v_d - m.R * b.i_d + w * m.L_q * b.i_q, np.nan)
@@ -96,7 +99,8 @@ class SteadyState:
         self.v_d_rest.add(rest)
         self.power.add(power)
         self.torque_rest.add(np.where(steady, b.torque - torque, np.nan))
-        return SteadyRows(np.asarray(1e-9 * (b.t_ns - (self._t0 or 0)), np.float64), psi, rest, torque, power, steady)
+        time_s = np.asarray(1e-9 * (b.t_ns - (self._t0 or 0)), np.float64)
+        return SteadyRows(time_s, psi, rest, torque, power, steady)
 
     def words(self) -> list[str]:
         """What was found, a line each."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, FrameBlock
-from ipmsm_can.mapping.convert import ANGLE_APART, QUALITY
+from ipmsm_can.mapping.convert import ANGLE_APART, QUALITY, spoils_dq
 from ipmsm_can.mapping.mapper import MappedBlock, Mapper
 from ipmsm_can.mapping.plan import Plan
 from ipmsm_can.wire.sequence import RESTARTED
@@ -109,6 +109,7 @@ class Survey:
         """Length of the voltage over the dc voltage."""
         self.begin_ns = self.end_ns = 0
         self.identifiers: set[int] = set()
+        self._spoils_dq = spoils_dq(plan.map)
         self._slope = np.zeros(2)
         self._last: tuple[int, float] | None = None
 
@@ -173,7 +174,8 @@ class Survey:
             s.apart.add(1e-9 * b.apart[number])
         usable = np.isfinite(b.i_alpha + b.i_beta + b.v_alpha + b.v_beta)
         self.usable += int(np.count_nonzero(usable))
-        self.dq += int(np.count_nonzero(np.isfinite(b.i_d + b.i_q + b.v_d + b.v_q + b.turning)))
+        dq = np.isfinite(b.i_d + b.i_q + b.v_d + b.v_q + b.turning) & (b.quality & self._spoils_dq == 0)
+        self.dq += int(np.count_nonzero(dq))
         self.encoder += int(np.count_nonzero(np.isfinite(b.theta_encoder) & (b.quality & ANGLE_APART == 0)))
         self.turning.add(np.abs(b.turning))
         self.current.add(np.fmax(np.hypot(b.i_alpha, b.i_beta), np.hypot(b.i_d, b.i_q)))
