@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ipmsm_can.bus.rows import RowBlock
 from ipmsm_can.cli import main
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs import write_log
-from ipmsm_can.mapping import load_map, make_plan, shipped_maps
+from ipmsm_can.mapping import MappedBlock, load_map, make_plan, shipped_maps
 from ipmsm_can.mapping.check import text
+from ipmsm_can.mapping.convert import CURRENT_APART, VOLTAGE_APART
 from ipmsm_can.mapping.load import map_folder
 from ipmsm_can.mapping.survey import Survey
+from ipmsm_can.mapping.track import MappedTracking
 from ipmsm_can.wire.protocol import Protocol
-from tests.mapping_traffic import dbc_text
-from tests.replaying import drive_frames, toml
+from ipmsm_can.wire.sequence import RESTARTED
+from tests.mapping_traffic import dbc_text, run
+from tests.replaying import column, config, drive_frames, toml
 from tests.test_mapping_drives import cascadia
 
 Capture = pytest.CaptureFixture[str]
@@ -174,6 +179,36 @@ def test_replay_fills_short_gaps_and_leaves_out_the_unusable(tmp_path: Path, cap
     assert f"{lost.sum()} lost, {lost.sum()} of them filled" in shown
     assert table.shape[0] == 5000 and table[:, 1].sum() == lost.sum()
     assert np.allclose(np.diff(table[:, 2]), 2e-4, atol=1e-9)
+    assert main(["replay", str(tmp_path / "a.blf"), "--drive", toml(tmp_path), "--out",
+                 str(tmp_path / "b.csv")]) == 0
+    native = np.loadtxt(tmp_path / "b.csv", delimiter=",", skiprows=1)
+    keep = [k for k in range(11) if k not in (0, 7)]
+    assert np.allclose(table[:, keep], native[:, keep], rtol=1e-6, atol=1e-6)
+
+
+def test_tracking_is_the_same_whatever_the_blocks_and_leaves_out_what_is_apart() -> None:
+    inverter = load_map("ipmsm_can")
+    block = drive_frames(Protocol(), 0.2)
+    block = block.take(np.random.default_rng(2).random(len(block)) > 0.02)
+    whole = run(block, inverter)
+    whole.quality[200:205] |= VOLTAGE_APART
+    whole.quality[300:330] |= CURRENT_APART
+    whole.i_beta[400] = np.nan
+    whole.gap[600] = RESTARTED
+    rows: list[list[RowBlock]] = []
+    for edges in ([0, len(whole)], [0, 1, 2, 199, 203, 310, 400, 401, 600, len(whole)]):
+        rows.append([])
+        tracking = MappedTracking(config(), inverter, 5000.0, rows[-1].append)
+        for a, b in pairwise(edges):
+            names = MappedBlock.__dataclass_fields__
+            tracking.feed(MappedBlock(**{n: np.ascontiguousarray(getattr(whole, n)[..., a:b]) for n in names}))
+        assert tracking.unusable == 36
+    for name in RowBlock.__dataclass_fields__:
+        assert np.array_equal(column(rows[0], name), column(rows[1], name)), name
+    # 30 samples and what was lost among them are more than max_gap: a hole, not a straight line
+    step = np.diff(column(rows[0], "sample"))
+    assert step.max() >= 31 and np.count_nonzero(step > 1) == 1
+    assert column(rows[0], "filled").sum() >= 6
 
 
 def test_replay_of_a_slow_drive_gives_steady_state_quantities(tmp_path: Path, car: str, capsys: Capture) -> None:
