@@ -143,6 +143,16 @@ def test_frames_full_of_noise_never_raise(tmp_path: Path, capsys: Capture) -> No
         assert "what it allows" in text(survey, "noise", name)
 
 
+def test_a_log_cut_off_is_checked_as_far_as_it_goes_and_exit_2(tmp_path: Path, capsys: Capture) -> None:
+    write_log(tmp_path / "long.blf", [drive_frames(Protocol(), 4.0)])
+    whole = (tmp_path / "long.blf").read_bytes()
+    (tmp_path / "cut.blf").write_bytes(whole[:len(whole) * 2 // 3])
+    assert main(["map", "--check", str(tmp_path / "cut.blf"), "ipmsm_can"]) == 2
+    shown = capsys.readouterr()
+    assert "what it allows" in shown.out and "what was readable is checked" in shown.err
+    assert shown.err.count("\n") == 1
+
+
 def test_list_and_show(capsys: Capture) -> None:
     assert main(["map", "list"]) == 0
     listed = capsys.readouterr().out.splitlines()

@@ -68,6 +68,14 @@ def test_paths_nodes_and_the_dbc(tmp_path: Path) -> None:
             make_plan(make_map(tmp_path, wrong, GOOD))
 
 
+def test_either_length_of_identifier_must_tell_messages_apart(tmp_path: Path) -> None:
+    both = DBC + dbc_text({0x80000001: ("Long", ['x : 0|8@1+ (1,0) [0|0] ""'])}).split("BU_: X")[1]
+    body = GOOD + '[torque]\nsignal = "Long.x"\n'
+    assert len(make_plan(make_map(tmp_path, both, body)).sources) == 2
+    with pytest.raises(MapError, match="two messages of the map have the identifier 0x1 in both lengths"):
+        make_plan(make_map(tmp_path, both, body, 'identifiers = "either length"'))
+
+
 def test_shipped_maps_load_and_fit_their_dbc() -> None:
     assert list(shipped_maps()) == [
         "cascadia_pm", "cascadia_pm_dq", "ipmsm_can", "moteus", "odrive", "openinverter", "vesc"]

@@ -104,6 +104,12 @@ def make_plan(inverter: InverterMap, *, node: int | None = None, pole_pairs: int
     named = {c.ref.message for c in channels if not c.ref.is_constant}
     sources = tuple(_source(inverter, database, message, [c for c in channels if c.ref.message == message], node)
                     for message in sorted(named))
+    if inverter.map.identifiers == "either length":
+        plain = [s.can_id & CAN_EFF_MASK for s in sources]
+        twice = [i for i in plain if plain.count(i) > 1]
+        if twice:
+            raise MapError('map.identifiers is "either length", and two messages of the map have the identifier '
+                           f'0x{twice[0]:X} in both lengths; allowed is "as in the DBC"')
     lead = next((c for c in channels if not c.ref.is_constant), None)
     if lead is None:
         raise MapError(f"the map {inverter.map.title!r} names no signal, only constants")
