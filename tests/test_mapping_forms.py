@@ -149,6 +149,16 @@ def test_what_is_no_measurement_becomes_nan_and_is_told(tmp_path: Path) -> None:
     assert (silent.quality & MISSING != 0).all() and np.isnan(silent.torque).all()
 
 
+def test_the_current_tells_a_speed_where_nothing_else_does_and_noise_tells_none(tmp_path: Path) -> None:
+    inverter = make_map(tmp_path, DBC, CURRENT)
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=40) + 1j * rng.normal(size=40)
+    i = TRUTH.i(T) + 0.02 * noise
+    turning = run(_block(x=i.real, y=i.imag), inverter).turning
+    assert np.abs(turning[12:] / TRUTH.omega(T)[12:] - 1.0).max() < 0.1
+    assert np.isnan(run(_block(x=noise.real, y=noise.imag), inverter).turning[15:]).all()
+
+
 def test_a_multiplexed_signal_counts_where_it_is_selected(tmp_path: Path) -> None:
     dbc = dbc_text({9: ("Rec", ['segment M : 0|8@1+ (1,0) [0|255] ""', 'ia m1 : 16|16@1- (0.1,0) [0|0] "A"',
                                 'ib m1 : 32|16@1- (0.1,0) [0|0] "A"', 'vd m2 : 16|16@1- (0.1,0) [0|0] "V"'])})

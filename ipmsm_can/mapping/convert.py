@@ -36,10 +36,12 @@ SETTINGS = np.dtype([
     ("limit_angle", "f8"), ("limit_ns", "f8"),
 ])
 STATE = np.dtype([("has", "i8"), ("t", "i8"), ("i_a", "f8"), ("i_b", "f8"), ("theta", "f8"), ("cross", "f8"),
-                  ("dot", "f8"), ("turn", "f8"), ("known", "i8")])
+                  ("dot", "f8"), ("all", "f8"), ("turn", "f8"), ("known", "i8")])
 
-_FORGET = 0.9
+_FORGET = 0.95
 """How much of the turning found so far stays with the next sample, where no speed is reported."""
+_COHERENT = 0.9
+"""Share of the current that must turn alike from sample to sample to tell a speed: noise alone has a quarter."""
 _ROOT3 = math.sqrt(3.0)
 
 
@@ -121,8 +123,11 @@ def _turning(st: Any, t: int, i_a: float, i_b: float, theta: float, omega: float
         elif np.isfinite(i_a) and np.isfinite(st.i_a) and np.isfinite(i_b) and np.isfinite(st.i_b):
             st.cross = _FORGET * st.cross + st.i_a * i_b - st.i_b * i_a
             st.dot = _FORGET * st.dot + st.i_a * i_a + st.i_b * i_b
-            if st.cross != 0.0 or st.dot != 0.0:
+            st.all = _FORGET * st.all + np.hypot(st.i_a, st.i_b) * np.hypot(i_a, i_b)
+            if np.hypot(st.cross, st.dot) > _COHERENT * st.all:
                 turned = np.arctan2(st.cross, st.dot)
+            else:
+                st.known = 0
         if np.isfinite(turned):
             st.turn = turned / dt
             st.known = 1
