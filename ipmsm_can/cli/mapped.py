@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +79,6 @@ def _track(config: DriveConfig, plan: Plan, rate: float, reader: Any, out: Path 
     from ipmsm_can.mapping.track import MappedTracking
 
     file = None if out is None else open_rows(out)
-    begin = time.monotonic()
     try:
         tracking = MappedTracking(config, plan.map, rate, None if file is None else file.write)
         for block in _blocks(plan, rate, reader):
@@ -89,7 +87,6 @@ def _track(config: DriveConfig, plan: Plan, rate: float, reader: Any, out: Path 
         if file is not None:
             file.close()
     print("\n".join(_lines(tracking, tracking.summary)))
-    print(f"replayed {tracking.summary.rows} samples in {time.monotonic() - begin:.2f} s, reading included")
     if out is not None:
         print(f"wrote {out}")
 
