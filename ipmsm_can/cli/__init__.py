@@ -21,6 +21,7 @@ COMMANDS = {
     "run": "the companion on a CAN bus",
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
+    "map": "maps of other inverters: list, show, check against a log",
     "paper": "run the paper's experiments again, with a verdict on each claim",
     "campaign": "thousands of random runs: is an angle called valid ever wrong",
     "config": "explain or check a drive.toml",

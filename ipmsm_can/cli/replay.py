@@ -46,6 +46,7 @@ examples:
   ipmsm-can replay run.blf --drive drive.toml
   ipmsm-can replay run.log.gz --drive drive.toml --out estimates.parquet
   ipmsm-can replay both.asc --drive a.toml --drive b.toml --out estimates.csv
+  ipmsm-can replay car.blf --drive drive.toml --map cascadia_pm
 
 exit codes: 0 all well, 2 bad input; a log that is cut off or damaged is bad input, too: what was readable of it is
 replayed, and one sentence says what was wrong
@@ -62,11 +63,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--drive", action="append", required=True, metavar="drive.toml",
                         help="configuration of a drive in the log; may be given several times")
     parser.add_argument("--out", metavar="FILE", help="write one row per sample to this .csv or .parquet file")
+    parser.add_argument("--map", metavar="MAP", help="the log is of another inverter: a map, or the name of one "
+                        "(docs/mapping.md, ipmsm-can map list)")
+    parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
     parser.add_argument("--channel", metavar="NAME", help="take only the frames of this channel of the log")
 
 
 def main(args: argparse.Namespace) -> int:
     """Replay; returns the exit code."""
+    if args.map is not None:
+        from ipmsm_can.cli.mapped import replay_mapped
+
+        _leave_on_sigterm()
+        return replay_mapped(args)
+    if args.node is not None:
+        raise ValueError("--node goes with --map; without a map the drive.toml has wire.node")
     from ipmsm_can.config import load_configs
     from ipmsm_can.config.build import build_protocol
     from ipmsm_can.logs import read_log

@@ -65,7 +65,7 @@ def parse_config(text: str, source: str = "drive.toml", folder: str | Path = "."
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{source}: {_syntax(str(error), text)}") from None
+        raise ConfigError(f"{source}: {toml_problem(str(error), text)}") from None
     except ValueError as error:
         raise ConfigError(f"{source}: not valid TOML: {error}") from None  # a number of thousands of digits
     except RecursionError:
@@ -88,7 +88,7 @@ def config_from(data: Mapping[str, Any], source: str = "drive.toml", folder: str
         raise ConfigError(f"{source}: {_sentence(problems[0], data)}{more}") from None
 
 
-def _syntax(message: str, text: str) -> str:
+def toml_problem(message: str, text: str) -> str:
     at = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
     what = message[: at.start()] if at else message
     line = int(at[1]) if at and at[1] else len(text.splitlines()) or 1
@@ -122,10 +122,10 @@ def _wrong(path: list[str], allowed: str, data: Mapping[str, Any], missing: bool
         return f"{dotted} is missing; allowed is {allowed}"
     if value is None:
         return f"{dotted} is {in_toml(_default(path))} by default; allowed is {allowed}"
-    return f"{dotted} is {_shortened(in_toml(value))}; allowed is {allowed}"
+    return f"{dotted} is {shortened(in_toml(value))}; allowed is {allowed}"
 
 
-def _shortened(text: str) -> str:
+def shortened(text: str) -> str:
     return text if len(text) <= 100 else f"{text[:90]}... ({len(text)} characters)"
 
 
@@ -141,7 +141,7 @@ def _unknown(path: list[str], data: Mapping[str, Any]) -> str:
     everywhere = [f"{section}.{key}" for section, model in sections.items() for key in model.model_fields]
     # A key that exists in another section was put into the wrong one; only then it may be misspelt.
     homes = [key for key in everywhere if key.split(".")[1] == path[-1] and what == "key"]
-    nearest = _nearest(path[-1], known)
+    nearest = nearest_word(path[-1], known)
     guess = homes[0] if homes else ".".join([*path[:-1], nearest]) if nearest else None
     hint = f"; did you mean {guess}?" if guess else ""
     names = ", ".join(known)
@@ -149,7 +149,7 @@ def _unknown(path: list[str], data: Mapping[str, Any]) -> str:
     return f"{'.'.join(path)} is not a known {what}{hint}" + (f" ({allowed})" if hint else f"; {allowed}")
 
 
-def _nearest(word: str, known: list[str]) -> str | None:
+def nearest_word(word: str, known: list[str]) -> str | None:
     folded = {name.lower(): name for name in reversed(known)}
     match = difflib.get_close_matches(word.lower(), folded, n=1, cutoff=0.6)
     return folded[match[0]] if match else None
