@@ -86,7 +86,8 @@ def _about_errors(r: HealthReport) -> Iterator[Finding]:
 def _about_losses(r: HealthReport) -> Iterator[Finding]:
     if r.kernel_drops > 0:
         yield Finding("error", f"The kernel of this computer dropped {r.kernel_drops} frames: they were on the "
-                               "bus, but were not read in time.", "Give the program more processor, or a larger buffer.")
+                               "bus, but were not read in time.",
+                      "Give the program more processor, or a larger buffer.")
     if r.errors.overflows:
         yield Finding("error", f"The CAN controller's own buffer overflowed {_times(r.errors.overflows)}.",
                       "The computer answers its interrupts too late.")

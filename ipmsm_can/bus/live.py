@@ -23,7 +23,7 @@ from ipmsm_can.bus.link import Link
 from ipmsm_can.bus.port import BusError, Port
 from ipmsm_can.companion import Companion
 from ipmsm_can.frames import FrameBlock
-from ipmsm_can.node import OLDEST_ANSWER, Tracked
+from ipmsm_can.node import OLDEST_ANSWER, STALE_AFTER_NS, Tracked
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.lane import FastLane
@@ -39,6 +39,7 @@ LOAD_EVERY = 32
 _KEPT = 1 << 16
 _ABSURD_S = 10.0
 """A first frame that seems to have waited longer was stamped by another clock than ours."""
+_STALE_S = 1e-9 * STALE_AFTER_NS + 0.5 * IDLE_S
 _NOTHING = FrameBlock.zeros(0)
 
 Observer = Callable[[FrameBlock, Sequence[Tracked], FrameBlock, int], None]
@@ -105,7 +106,7 @@ class LiveRunner:
     def _wait_for_bus(self, link: Link, error: BusError, stop: Callable[[], bool],
                       observer: Observer | None) -> None:
         """Take in what had arrived; then try again and again, while the companion sees silence go by."""
-        self._deaf_round(link.lose(error), 0.0, observer)
+        self._deaf_round(link.lose(error), _STALE_S, observer)  # what it claimed is over at once
         while not stop():
             self._deaf_round(_NOTHING, link.pause(), observer)
             if link.retry():
@@ -125,6 +126,8 @@ class LiveRunner:
             passed_s -= step
             self._now_ns += round(1e9 * step)
             self.companion.respond([], self._now_ns)
+        for node in self.companion.nodes.values():
+            node.update_state(self._now_ns)
         self._weigh(block, _NOTHING, self._now_ns, at_once=True)
         if observer is not None:
             observer(block, tracked, _NOTHING, self._now_ns)
