@@ -118,7 +118,7 @@ class BusHealth:
         errors = self._errors.update(block)
         if len(errors):
             bits = (errors.protocol[:, None] >> np.arange(8, dtype=np.uint8)) & 1
-            self._violations += bits.sum(axis=0)
+            self._violations += bits.sum(axis=0, dtype=np.int64)
             self._places += np.bincount(errors.location, minlength=256)
 
     def _follow_drives(self, block: FrameBlock) -> None:
