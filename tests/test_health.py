@@ -163,7 +163,8 @@ def test_a_quiet_bus_has_no_findings() -> None:
     assert r.findings == ()
     assert "Nothing remarkable." in text(r)
     slow, = (i for i in r.ids if i.can_id == 0x350)
-    assert (slow.period, slow.steady, slow.least, slow.most) == (pytest.approx(0.1, rel=1e-6), True, 10, 10)
+    assert slow.period == pytest.approx(0.1, rel=1e-6)
+    assert (slow.steady, slow.least, slow.most) == (True, 10, 10)
 
 
 def test_load_is_told_from_70_percent_on_and_where_the_bit_rate_must_be_wrong() -> None:
@@ -394,8 +395,9 @@ def test_a_recording_is_told_in_words_and_in_json(recording: Path, capsys: pytes
     # a BLF file may come from anywhere: the same error frame is only counted
     blf = json.loads(told(["bus", str(recording.with_suffix(".blf")), "--json"], capsys)[1])
     assert (blf["errors"]["frames"], blf["errors"]["decoded"], blf["errors"]["tx_errors"]) == (1, False, -1)
-    assert [{**i, "x": 0} for i in blf["ids"]] == [{**i, "x": 0} for i in data["ids"]] or len(blf["ids"]) == len(
-        data["ids"])
+    for name in ("label", "count", "min_length", "length_changes", "steady"):
+        assert [i[name] for i in blf["ids"]] == [i[name] for i in data["ids"]]
+    assert blf["drives"][0]["received"] == data["drives"][0]["received"]
 
 
 def test_a_foreign_database(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -248,6 +248,15 @@ def test_injection_stops_and_only_the_scheduler_lets_it_begin_again(monkeypatch:
     assert max(np.diff([0.0, *after])) < 0.5 * before[-1]
 
 
+def test_the_compiled_loop_is_handed_the_new_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    over: list[object] = []
+    monkeypatch.setattr("ipmsm_can.bus.lane.FastLane.over", lambda port, _: over.append(port))
+    air = Air(traffic(600.0, 1.5), outages(1, 1.0, 0.3), replaced=True)
+    run = Run(air, True).go(monkeypatch)
+    assert len(over) == 2 and over[0] is not over[1]
+    assert over[1] is run.runner.port is run.link.port
+
+
 def test_without_a_link_a_run_ends() -> None:
     air = Air(traffic(600.0, 1.0), outages(1, 1.0, 0.2, first=0.3), False)
     runner = LiveRunner(air.open(), Companion([CONFIG], PROTOCOL, True), 1e6, 5e6)

@@ -166,7 +166,7 @@ def count_frames(raw: NDArray[np.uint8], t_ns: Ints, nominal: Ints, data: Ints, 
         total.data += data[k]
         total.window_nominal += nominal[k]
         total.window_data += data[k]
-        at = _place(entries, total, can_id & 0x9FFFFFFF)
+        at = _place(entries, total, can_id & (0x9FFFFFFF if can_id & 0x80000000 else 0x7FF))
         if at < 0:
             total.unkept += 1
             continue

@@ -110,7 +110,8 @@ class LiveRunner:
         while not stop():
             self._deaf_round(_NOTHING, link.pause(), observer)
             if link.retry():
-                self.port, self._lane = link.port, self._find_lane()
+                self.port = link.port
+                self._lane = self._find_lane()
                 return
 
     def _deaf_round(self, block: FrameBlock, passed_s: float, observer: Observer | None) -> None:
