@@ -97,7 +97,7 @@ class BusHealth:
             return
         with self._lock:
             nominal, data = frame_bits(block)
-            self._load.update(block)
+            self._load.update(block, (nominal, data))
             count_frames(np.ascontiguousarray(block.raw), np.ascontiguousarray(block.t_ns), nominal, data,
                          1e9 / self._rates[0], 1e9 / self._rates[1], self._entries, self._total)
             self._count_errors(block)
