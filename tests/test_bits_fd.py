@@ -1,8 +1,8 @@
 """CAN FD frames bit by bit with real CRCs, stuff count and fixed stuff bits, read back by a receiver.
 
 ISO 11898-1:2015, clause 10 (fields, stuffing, CRC, stuff count).  The receiver knows only the rules of reception:
-it takes stuff bits out, checks every one of them, the count, and the CRC.  What it accepts is a frame, so its length
-is that on the wire, and `frame_bits` has to say the same.
+it takes stuff bits out, checks every one of them, the count, and the CRC.  What it accepts is a frame, so its
+length is that on the wire, and `frame_bits` has to say the same.
 """
 
 from __future__ import annotations

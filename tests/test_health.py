@@ -197,6 +197,20 @@ def test_a_pause_of_one_sender_and_the_silence_of_all() -> None:
     assert told.startswith("The whole bus was silent for 2.5") and "pauses" not in told
 
 
+def test_a_pause_of_its_own_is_told_beside_the_silence_of_all() -> None:
+    block = merged(cyclic(0x120, 0.01, 12.0, jitter=3e-4), cyclic(0x300, 0.05, 12.0))
+    told = sentences(report(without(without(block, 3.0, 4.5), 6.0, 9.0, 0x120)))
+    assert "The whole bus was silent for 1.5" in told
+    assert "with pauses: 0x120 every 10 ms, once not for 3.0" in told and "0x300" not in told
+    told = sentences(report(without(without(block, 3.0, 4.5), 2.0, 6.0, 0x120)))
+    assert "The whole bus was silent for 1.5" in told
+    assert "with pauses: 0x120 every 10 ms, once not for 4.0" in told and "0x300" not in told
+
+
+def test_a_few_frames_in_a_row_are_no_load() -> None:
+    assert report(cyclic(0x100, 2.5e-4, 0.002)).findings == ()
+
+
 def test_sporadic_frames_pause_without_being_told() -> None:
     block = cyclic(0x120, 0.01, 60.0)
     gaps = np.random.default_rng(2).exponential(0.05, len(block))

@@ -5,13 +5,17 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 import pytest
 
+from ipmsm_can.bus.health import BusHealth
 from ipmsm_can.bus.link import Link
+from ipmsm_can.bus.listen import Listener
 from ipmsm_can.bus.live import LiveRunner
-from ipmsm_can.bus.port import BusError
+from ipmsm_can.bus.port import BusError, open_port
+from ipmsm_can.bus.pythoncan import PythonCanPort
 from ipmsm_can.cli import plain
 from ipmsm_can.cli.monitor import RunMonitor
 from ipmsm_can.cli.render import render
@@ -289,7 +293,7 @@ class Counting:
         Counting.open_now -= 1
         raise RuntimeError("the vendor's library is upset")
 
-    def __enter__(self) -> Counting:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -323,6 +327,56 @@ def test_an_adapter_is_closed_before_it_is_opened_again_and_its_counts_are_kept(
     assert (link.drops, link.unsent, link.outages, link.outage_time) == (10, 12, 1, 1.0)
     assert link.past[0].reason == "can7 is gone: No such device"
     assert Counting.open_now == 1
+
+
+class Waiting(Counting):
+    """A port whose socket still holds an error before the frames: the loss was told by something else."""
+
+    def receive(self, timeout_s: float, expect: int = 1) -> FrameBlock:
+        if self.drops:
+            self.drops = 0
+            raise GONE
+        return super().receive(timeout_s, expect)
+
+
+def test_frames_behind_a_pending_error_are_read() -> None:
+    Counting.open_now = 0
+    link = Link(Waiting(1, 0), lambda: Counting(0, 0))
+    assert len(link.lose(DOWN)) == 10
+    assert link.words.endswith("can7 is down; bring it up")
+
+
+@pytest.mark.parametrize("reconnect", [False, True])
+def test_a_listener_counts_what_had_arrived(reconnect: bool) -> None:
+    """Also where it is to end with the bus: the frames that waited behind the error are in the report."""
+    Counting.open_now = 0
+    health = BusHealth(1e6, 1e6)
+    link = Link(Waiting(1, 0), lambda: Counting(0, 0), sleep=lambda _: None)
+    listener = Listener(link, health, True, reconnect)
+    asked = iter([False] * 6 + [True] * 100)
+    if reconnect:
+        listener.run(lambda: next(asked))
+    else:
+        with pytest.raises(BusError, match="can7 is gone"):
+            listener.run(lambda: next(asked))
+    r = listener.report()
+    # of six rounds one fails and one waits for the bus; the other four read the new port
+    assert r.frames == (18 if reconnect else 10)
+    assert r.outages == 1 and (r.no_bus == "") == reconnect
+
+
+def test_a_python_can_bus_that_fails_is_opened_again() -> None:
+    options = {"interface": "virtual", "channel": "ipmsm-link"}
+    with open_port(options) as other, Link(open_port(options), lambda: open_port(options)) as link:
+        other.send(FrameBlock.zeros(3))
+        assert isinstance(link.port, PythonCanPort)
+        link.port._bus.shutdown()  # as an adapter that is pulled out
+        with pytest.raises(BusError) as lost:
+            link.port.receive(0.0)
+        link.lose(lost.value)
+        assert link.retry() and not link.down
+        other.send(FrameBlock.zeros(4))
+        assert len(link.port.receive(1.0)) == 4
 
 
 def test_a_clock_that_is_set_makes_no_long_pause() -> None:

@@ -128,6 +128,24 @@ def test_no_reconnect_ends_with_what_was_heard(command: str, config: str, monkey
         assert "600 frames received" in out
 
 
+@pytest.mark.parametrize("command", ["run", "bus"])
+def test_no_bus_at_the_end_is_a_fault(command: str, config: str, monkeypatch: pytest.MonkeyPatch,
+                                      capsys: pytest.CaptureFixture[str]) -> None:
+    Ear.at = Ear.opened = 0
+    frames = everything()
+
+    def open_bus(*_: object) -> Ear:
+        if Ear.opened:
+            raise BusError("there is no CAN interface 'can0' (No such device)")
+        return Ear(frames, True)
+
+    monkeypatch.setattr(bus, "open_bus", open_bus)
+    words = [config] if command == "run" else []
+    assert main([command, *words, "-i", "virtual", "-c", "ear", "--quiet", "--duration", "0.8"]) == 1
+    out, err = capsys.readouterr()
+    assert "there is no bus since " in (out + err).lower() and "there is no CAN interface 'can0'" in out + err
+
+
 @pytest.mark.parametrize(("words", "voice"), [
     (["run", "CONFIG"], "SILENT (listening only)"),
     (["run", "CONFIG", "--transmit"], "TRANSMITTING"),

@@ -40,7 +40,7 @@ def _about_the_bus(r: HealthReport) -> Iterator[Finding]:
     if r.outages:
         yield Finding("error", f"The bus went away {_times(r.outages)}, for {seconds(r.outage_time)} in all.",
                       "What was sent meanwhile is missing. Check plug, supply and interface.")
-    load = max(r.peak_load, r.mean_load)
+    load = max(r.peak_load, r.mean_load if r.duration >= 1.0 else 0.0)  # a few frames in a row are no load
     if load > 1.0:
         yield Finding("warning", f"The frames take {100 * load:.0f} % of the time, more than a bus of "
                                  f"{_rate(r.bitrate)} can carry.",
@@ -124,7 +124,8 @@ def loss_place(r: HealthReport, d: DriveHealth) -> str:
 
 def _about_ids(r: HealthReport) -> Iterator[Finding]:
     paused = [i for i in r.ids if i.steady and i.max_gap > max(PAUSE * i.period, PAUSE_LEAST_S)]
-    shared = [i for i in paused if i.max_gap_at >= r.silence_at - i.period and r.silence > SILENCE_S]
+    shared = [i for i in paused if r.silence > SILENCE_S and i.max_gap < r.silence + 3.0 * i.period
+              and i.max_gap_at <= r.silence_at < i.max_gap_at + i.max_gap]
     alone = [i for i in paused if i not in shared]
     if alone:
         yield Finding("warning", "Sent by the clock, but with pauses: " + _named(

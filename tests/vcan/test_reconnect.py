@@ -174,6 +174,23 @@ def test_twenty_outages_while_answering(vcan7: str) -> None:
     assert laps and laps[-1] > link.past[-1].ended_ns
 
 
+def test_an_interface_made_anew_between_two_looks_is_noticed(vcan7: str) -> None:
+    """The name is there and up, but it is another one; its old socket would wait for ever."""
+    with SocketCanPort(vcan7) as port:
+        port.check()
+        ip("link", "del", vcan7)
+        ip("link", "add", "dev", vcan7, "type", "vcan")
+        ip("link", "set", vcan7, "up")
+        with pytest.raises(BusError, match="vcan7 was taken away and another put in its place"):
+            port.check()
+        link = Link(port, lambda: SocketCanPort(vcan7))
+        link.lose(BusError("test"))
+        assert link.retry() and link.port is not port
+        with link, SocketCanPort(vcan7) as sender:
+            sender.send(FrameBlock.zeros(3))
+            assert len(link.port.receive(1.0)) > 0
+
+
 def test_the_commands_go_on_and_say_so(vcan7: str, tmp_path: Path) -> None:
     config = tmp_path / "drive.toml"
     config.write_text('[motor]\npreset = "m2"\n')
