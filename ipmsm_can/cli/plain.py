@@ -82,7 +82,9 @@ def health_line(status: HealthStatus) -> str:
     begin = f"{clock(status.elapsed)} {SILENT} "
     if r.no_bus:
         return begin + r.no_bus
-    text = begin + f"load {100 * r.load:.1f} % frames {r.frames} ids {len(r.ids)} drops {max(0, r.kernel_drops)}"
+    text = begin + f"load {100 * r.load:.1f} % frames {r.frames} ids {len(r.ids)}"
+    if r.kernel_drops >= 0:
+        text += f" drops {r.kernel_drops}"
     if r.errors.frames:
         text += f" error frames {r.errors.frames}"
     first = next((f for f in r.findings if f.severity != "notice"), None)
