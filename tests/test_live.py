@@ -268,7 +268,8 @@ def test_a_bus_that_goes_away_is_a_fault(command: str, config: str, monkeypatch:
                                          capsys: pytest.CaptureFixture[str]) -> None:
     port = LeavingPort()
     monkeypatch.setattr(bus, "open_bus", lambda *_: port)
-    code = main([command, config, "-i", "virtual", "-c", "pulled", "--quiet"])
+    code = main([command, config, "-i", "virtual", "-c", "pulled", "--quiet",
+                 *(["--no-reconnect"] if command == "run" else [])])
     out, err = capsys.readouterr()
     assert code == 1
     assert port.closed

@@ -237,9 +237,9 @@ class BusLoad:
         self._state = np.array([-1, 0, 0], np.int64)
         self.update(FrameBlock.zeros(0))
 
-    def update(self, block: FrameBlock) -> None:
-        """Count the frames of a block at their t_ns."""
-        nominal, data = frame_bits(block)
+    def update(self, block: FrameBlock, bits: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None) -> None:
+        """Count the frames of a block at their t_ns.  bits: what `frame_bits` says of it, where that is known."""
+        nominal, data = frame_bits(block) if bits is None else bits
         _load(np.ascontiguousarray(block.t_ns), nominal, data, self._bin_ns, self._bins, self._state)
 
     def load(self, now_ns: int | None = None) -> float:

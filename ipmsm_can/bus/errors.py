@@ -55,12 +55,12 @@ _CLASS_WORDS = {
 _RX_OVERFLOW, _TX_OVERFLOW = 0x01, 0x02
 _RX_WARNING, _TX_WARNING, _RX_PASSIVE, _TX_PASSIVE, _AGAIN_ACTIVE = 0x04, 0x08, 0x10, 0x20, 0x40
 
-_PROTOCOL_WORDS = {
+PROTOCOL_WORDS = {
     0x01: "single bit error", 0x02: "frame format error", 0x04: "bit stuffing error",
     0x08: "dominant bit not sent", 0x10: "recessive bit not sent", 0x20: "bus overload",
     0x40: "active error announcement", 0x80: "while transmitting",
 }
-_LOCATION_WORDS = {
+LOCATION_WORDS = {
     0x02: "ID bits 28 to 21", 0x03: "start of frame", 0x04: "substitute RTR bit",
     0x05: "identifier extension",
     0x06: "ID bits 20 to 18", 0x07: "ID bits 17 to 13", 0x08: "CRC sequence", 0x09: "reserved bit 0",
@@ -68,7 +68,7 @@ _LOCATION_WORDS = {
     0x0F: "ID bits 12 to 5", 0x12: "intermission", 0x18: "CRC delimiter", 0x19: "ACK slot",
     0x1A: "end of frame", 0x1B: "ACK delimiter",
 }
-_STATE_WORDS = {
+STATE_WORDS = {
     BusState.UNKNOWN: "state not told", BusState.ACTIVE: "error active (normal)",
     BusState.WARNING: "error warning (a counter above 96)",
     BusState.PASSIVE: "error passive (a counter above 127)", BusState.BUS_OFF: "bus-off (silent)",
@@ -107,13 +107,13 @@ class ErrorFrames:
         parts = [words for bit, words in _CLASS_WORDS.items() if kind & bit and bit not in
                  (ErrorClass.CONTROLLER, ErrorClass.PROTOCOL)]
         if kind & ErrorClass.CONTROLLER:
-            told = [_STATE_WORDS[BusState(int(self.state[index]))]] if self.state[index] >= 0 else []
+            told = [STATE_WORDS[BusState(int(self.state[index]))]] if self.state[index] >= 0 else []
             told += ["receive buffer overflow"] if self.rx_overflow[index] else []
             told += ["transmit buffer overflow"] if self.tx_overflow[index] else []
             parts.append("controller: " + (", ".join(told) or "unspecified"))
         if kind & ErrorClass.PROTOCOL:
-            bits = [w for bit, w in _PROTOCOL_WORDS.items() if self.protocol[index] & bit]
-            place = _LOCATION_WORDS.get(int(self.location[index]))
+            bits = [w for bit, w in PROTOCOL_WORDS.items() if self.protocol[index] & bit]
+            place = LOCATION_WORDS.get(int(self.location[index]))
             parts.append("protocol violation: " + (" ".join(bits) or "unspecified")
                          + (f" in {place}" if place else ""))
         if self.tx_errors[index] >= 0:
@@ -197,17 +197,21 @@ class ErrorCounters:
         self.last = errors.sentence(len(errors) - 1)
         return errors
 
+    def kinds(self) -> dict[str, int]:
+        """How often each class came that came at all, in words."""
+        return {_CLASS_WORDS[bit]: n for bit, n in self.counts.items() if n}
+
     def summary(self) -> str:
         """One line for people."""
         if not self.frames:
             return "no error frames"
-        told = [f"{n} x {_CLASS_WORDS[bit]}" for bit, n in self.counts.items() if n]
+        told = [f"{n} x {words}" for words, n in self.kinds().items()]
         text = f"{self.frames} error frame{'s' if self.frames > 1 else ''}: "
         text += ", ".join(told) or "unknown class"
         if self.state >= 0:
-            text += f"; now {_STATE_WORDS[self.state]}"
+            text += f"; now {STATE_WORDS[self.state]}"
             if self.worst > self.state:
-                text += f", worst {_STATE_WORDS[self.worst]}"
+                text += f", worst {STATE_WORDS[self.worst]}"
         if self.overflows:
             text += f"; controller buffer overflowed {self.overflows} x"
         if self.tx_errors >= 0:

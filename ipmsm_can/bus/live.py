@@ -19,10 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can.bus.bits import BusLoad
-from ipmsm_can.bus.port import Port
+from ipmsm_can.bus.link import Link
+from ipmsm_can.bus.port import BusError, Port
 from ipmsm_can.companion import Companion
 from ipmsm_can.frames import FrameBlock
-from ipmsm_can.node import OLDEST_ANSWER, Tracked
+from ipmsm_can.node import OLDEST_ANSWER, STALE_AFTER_NS, Tracked
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.lane import FastLane
@@ -38,6 +39,7 @@ LOAD_EVERY = 32
 _KEPT = 1 << 16
 _ABSURD_S = 10.0
 """A first frame that seems to have waited longer was stamped by another clock than ours."""
+_STALE_S = 1e-9 * STALE_AFTER_NS + 0.5 * IDLE_S
 _NOTHING = FrameBlock.zeros(0)
 
 Observer = Callable[[FrameBlock, Sequence[Tracked], FrameBlock, int], None]
@@ -65,11 +67,14 @@ class Turnaround:
 class LiveRunner:
     """Companion and port together.
 
-    bitrate, data_bitrate: for the bus load [bit/s].
+    bitrate, data_bitrate: for the bus load [bit/s].  link: opens the port again when its bus goes away; without
+    one, `run` ends then.
     """
 
-    def __init__(self, port: Port, companion: Companion, bitrate: float, data_bitrate: float) -> None:
+    def __init__(self, port: Port, companion: Companion, bitrate: float, data_bitrate: float,
+                 link: Link | None = None) -> None:
         self.port = port
+        self.link = link
         self.companion = companion
         self.turnaround = Turnaround()
         self.load = BusLoad(bitrate, data_bitrate)
@@ -89,9 +94,54 @@ class LiveRunner:
         return FastLane.over(self.port, self.companion)
 
     def run(self, stop: Callable[[], bool], observer: Observer | None = None) -> None:
-        """Serve the bus until stop() says so; raises BusError when the bus goes away."""
+        """Serve the bus until stop() says so; raises BusError when the bus goes away and there is no link."""
         while not stop():
-            self.round(observer)
+            try:
+                self.round(observer)
+            except BusError as error:
+                if self.link is None:
+                    raise
+                self._wait_for_bus(self.link, error, stop, observer)
+
+    def _wait_for_bus(self, link: Link, error: BusError, stop: Callable[[], bool],
+                      observer: Observer | None) -> None:
+        """Take in what had arrived; then try again and again, while the companion sees silence go by."""
+        self._deaf_round(link.lose(error), _STALE_S, observer)  # what it claimed is over at once
+        while not stop():
+            self._deaf_round(_NOTHING, link.pause(), observer)
+            if link.retry():
+                self.port = link.port
+                self._lane = self._find_lane()
+                return
+
+    def _deaf_round(self, block: FrameBlock, passed_s: float, observer: Observer | None) -> None:
+        """A round whose answers nobody could hear; in steps no longer than the bus would make them, so that the
+        scheduler comes to rest as it does on a silent one."""
+        self._flowing = False
+        if len(block):
+            self._time(block)
+        tracked = self.companion.feed(block)
+        self.companion.respond(tracked, self._now_ns, late=True)
+        while passed_s > 0.0:
+            step = min(passed_s, IDLE_S)
+            passed_s -= step
+            self._now_ns += round(1e9 * step)
+            self.companion.respond([], self._now_ns)
+        for node in self.companion.nodes.values():
+            node.update_state(self._now_ns)
+        self._weigh(block, _NOTHING, self._now_ns, at_once=True)
+        if observer is not None:
+            observer(block, tracked, _NOTHING, self._now_ns)
+
+    @property
+    def drops(self) -> int:
+        """Frames that arrived and were lost before they were read, of all ports so far."""
+        return self.port.drops if self.link is None else self.link.drops
+
+    @property
+    def unsent(self) -> int:
+        """Frames that could not be sent, of all ports so far."""
+        return self.port.unsent if self.link is None else self.link.unsent
 
     def round(self, observer: Observer | None = None) -> None:
         """Wait for the frames up to the next one that is to be answered, and answer."""

@@ -47,9 +47,6 @@ class Port(Protocol):
         With expect > 1 it waits for that many, at most timeout_s for each, and takes no more: a reader that
         knows when it will have something to do is not woken before.
 
-        With expect > 1 it waits for that many, at most timeout_s for each, and takes no more: a reader that
-        knows when it will have something to do is not woken before.
-
         Returns an empty block on time-out or a signal.  The block stays valid.  t_ns is Unix time.
         Raises BusError when the interface went down or away.
         """

@@ -193,6 +193,7 @@ class SocketCanPort:
         option(_SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         option(_SOL_SOCKET, _SO_SNDTIMEO, struct.pack("@ll", 0, int(_SEND_PATIENCE_S * 1e6)))
         self._socket.bind((self._channel,))
+        self._index = socket.if_nametoindex(self._channel)
         return use_fd
 
     def _check_interface(self) -> int:
@@ -262,8 +263,14 @@ class SocketCanPort:
             self._set_timeout(timeout_s)
 
     def check(self) -> None:
-        """Raise BusError when the interface is gone or down."""
+        """Raise BusError when the interface is down or gone, or was made anew: this socket is bound to the old."""
         self._check_interface()
+        try:
+            index = socket.if_nametoindex(self._channel)
+        except OSError:
+            index = 0
+        if index != self._index:
+            raise BusError(errno.ENODEV, f"{self._channel} was taken away and another put in its place")
 
     def fileno(self) -> int:
         """The socket's handle, for select and event loops."""

@@ -12,6 +12,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import NoReturn
 
 from ipmsm_can import __version__
@@ -22,12 +23,16 @@ COMMANDS = {
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",
+    "bus": "health of a bus, live or recorded: load, losses, errors, clocks",
     "paper": "run the paper's experiments again, with a verdict on each claim",
     "campaign": "thousands of random runs: is an angle called valid ever wrong",
     "config": "explain or check a drive.toml",
     "completion": "print a completion script for your shell",
 }
 """Commands and what they do, in the order of the help."""
+
+_MODULES = {"bus": "health"}
+"""Modules that are not named as their command is: `cli.bus` is what all commands on a bus share."""
 
 _DESCRIPTION = """\
 Rotor position of interior permanent magnet motors from sampled currents and voltages on CAN.
@@ -39,11 +44,16 @@ examples:
   ipmsm-can demo                                   see it work, on vcan0 or a bus inside the program
   ipmsm-can config --explain > drive.toml          a commented configuration to start from
   ipmsm-can run drive.toml -i socketcan -c can0    listen to a drive; add --transmit to answer it
+  ipmsm-can bus -i socketcan -c can0               is the bus well? listens only
   ipmsm-can replay run.blf --drive drive.toml --out estimates.csv
 
 exit codes: 0 all well, 1 ran and found a fault, 2 bad input
 `ipmsm-can COMMAND --help` says more about each command.
 """
+
+
+def _module(command: str) -> ModuleType:
+    return import_module(f"ipmsm_can.cli.{_MODULES.get(command, command)}")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -61,7 +71,7 @@ def build_parser(commands: Sequence[str]) -> argparse.ArgumentParser:
     sub = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, text in COMMANDS.items():
         if name in commands:
-            module = import_module(f"ipmsm_can.cli.{name}")
+            module = _module(name)
             child = sub.add_parser(name, help=text, description=module.HELP, epilog=module.EPILOG,
                                    formatter_class=argparse.RawDescriptionHelpFormatter)
             module.add_arguments(child)
@@ -76,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     named = next((word for word in argv if not word.startswith("-")), "")
     parser = build_parser([named])
     args = parser.parse_args(argv)
-    module = import_module(f"ipmsm_can.cli.{args.command}")
+    module = _module(args.command)
     try:
         code: int = module.main(args)
         return code

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ipmsm_can.bus.errors import ErrorCounters
+from ipmsm_can.bus.errors import BusState, ErrorCounters
 from ipmsm_can.cli.status import BusStatus, DriveNodeStatus, DriveStatus, NodeStatus, RunStatus
 from ipmsm_can.encoder import NOTABLE, EncoderCheck
 from ipmsm_can.estimation import confidence
@@ -92,6 +92,7 @@ class RunMonitor:
         """As of now."""
         now = time.monotonic()
         companion, port = self.runner.companion, self.runner.port
+        link = self.runner.link
         counts = companion.counts
         counted = {"frames": counts.frames}
         for number, node in companion.nodes.items():
@@ -105,15 +106,27 @@ class RunMonitor:
             self._turnaround = (p50, p99)
         bus = BusStatus(
             description=port.description, load=companion.bus_load, frames=counts.frames,
-            frames_per_s=rates["frames"], sent=self.runner.sent, unsent=port.unsent,
+            frames_per_s=rates["frames"], sent=self.runner.sent, unsent=self.runner.unsent,
             late=companion.late, unknown=counts.unknown,
-            remote=counts.remote, wrong_length=counts.wrong_length, drops=port.drops,
+            remote=counts.remote, wrong_length=counts.wrong_length, drops=self.runner.drops,
             error_frames=self.errors.frames, errors=self.errors.summary(),
-            turnaround_p50=self._turnaround[0], turnaround_p99=self._turnaround[1])
+            turnaround_p50=self._turnaround[0], turnaround_p99=self._turnaround[1],
+            no_bus=self._no_bus(), outages=0 if link is None else link.outages,
+            outage_time=0.0 if link is None else link.outage_time)
         nodes = tuple(_node_status(node, rates[f"samples {number}"], rates[f"estimates {number}"],
                                    self._ever.get(number, 0))
                       for number, node in companion.nodes.items())
         return RunStatus(self.title, now - self._begin, companion.transmit, bus, nodes)
+
+    def _no_bus(self) -> str:
+        """Why there is no bus now: the interface is gone, or its controller has switched itself off."""
+        link = self.runner.link
+        if link is not None and link.down:
+            return link.words
+        if self.errors.state is BusState.BUS_OFF:
+            return ("no bus: the controller is bus-off (`ip link set can0 type can restart-ms 100` lets it come "
+                    "back by itself)")
+        return ""
 
 
 def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever: int) -> NodeStatus:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ipmsm_can.cli.status import BusStatus, DriveStatus, NodeStatus, RunStatus, Status
+from ipmsm_can.bus import health_words
+from ipmsm_can.cli.status import BusStatus, DriveStatus, HealthStatus, NodeStatus, RunStatus, Status
 
 SILENT = "SILENT (listening only)"
 TRANSMITTING = "TRANSMITTING"
@@ -50,14 +51,21 @@ def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:
 
 def line(status: Status) -> str:
     """One line."""
+    if isinstance(status, HealthStatus):
+        return health_line(status)
     if isinstance(status, DriveStatus):
         drives = " | ".join(
             f"drive {n.node} {n.rpm:+.1f} rpm (asked {n.reference_rpm:+.1f}), {n.torque:+.2f} N m, "
             f"probing {n.waveform} {n.amplitude:.1f} V" for n in status.nodes)
-        return f"{clock(status.elapsed)} {status.sent_per_s:.0f} frames/s unsent {status.unsent} | {drives}"
+        return (f"{clock(status.elapsed)} {TRANSMITTING} {status.sent_per_s:.0f} frames/s unsent {status.unsent} "
+                f"| {drives}")
     bus = status.bus
+    if bus.no_bus:
+        return f"{clock(status.elapsed)} {voice(status)} {bus.no_bus}"
     text = (f"{clock(status.elapsed)} {voice(status)} load {100 * bus.load:.1f} % {bus.frames_per_s:.0f} frames/s"
             f" drops {bus.drops}")
+    if bus.outages:
+        text += f" outages {bus.outages}"
     if bus.error_frames:
         text += f" error frames {bus.error_frames}"
     for n in status.nodes:
@@ -70,8 +78,25 @@ def line(status: Status) -> str:
     return text
 
 
+def health_line(status: HealthStatus) -> str:
+    """One line of a bus that is listened to."""
+    r = status.report
+    begin = f"{clock(status.elapsed)} {SILENT} "
+    if r.no_bus:
+        return begin + r.no_bus
+    text = begin + f"load {100 * r.load:.1f} % frames {r.frames} ids {len(r.ids)}"
+    if r.kernel_drops >= 0:
+        text += f" drops {r.kernel_drops}"
+    if r.errors.frames:
+        text += f" error frames {r.errors.frames}"
+    first = next((f for f in r.findings if f.severity != "notice"), None)
+    return text + (f" | {first.sentence}" if first else "")
+
+
 def summary(status: Status) -> str:
     """What happened, when all is over."""
+    if isinstance(status, HealthStatus):
+        return health_words.text(status.report)
     if isinstance(status, DriveStatus):
         text = f"{status.sent} frames sent in {status.elapsed:.1f} s, {status.unsent} unsent"
         if status.slips:
@@ -82,6 +107,10 @@ def summary(status: Status) -> str:
     lines = [f"{voice(status)} for {status.elapsed:.1f} s on {bus.description}: {bus.frames} frames received, "
              f"{bus.sent} sent, load at the end {100 * bus.load:.1f} %",
              "bus: " + ", ".join(f"{name} {n}" for name, n in bus_troubles(bus)) + f"; {bus.errors}"]
+    if bus.outages:
+        times = "once" if bus.outages == 1 else f"{bus.outages} times"
+        lines.append(f"the bus went away {times}, for {bus.outage_time:.1f} s in all"
+                     + (f"; {bus.no_bus}" if bus.no_bus else "; it came back by itself"))
     if status.transmit:
         lines.append(f"answers: turnaround {turnaround(bus)}, unsent {bus.unsent}, too late {bus.late}")
     for n in status.nodes:

@@ -7,7 +7,8 @@ import textwrap
 from rich.text import Text
 
 from ipmsm_can.cli import plain
-from ipmsm_can.cli.status import DriveStatus, NodeStatus, RunStatus, Status
+from ipmsm_can.cli.health_view import health_lines
+from ipmsm_can.cli.status import DriveStatus, HealthStatus, NodeStatus, RunStatus, Status
 
 _BLOCK_LINES = 8
 _LABEL = 9
@@ -16,7 +17,12 @@ _ERROR_LINES = 3
 
 def render(status: Status, width: int, height: int) -> Text:
     """A status as at most `height` lines of at most `width` columns."""
-    lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
+    if isinstance(status, HealthStatus):
+        badge = Text(f" {plain.SILENT} ", style="reverse")
+        lines = _header(status.title, badge, status.elapsed, status.report.source, width)
+        lines += health_lines(status.report, width, height - len(lines))
+    else:
+        lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
     if len(lines) > height:
         lines = [*lines[:height - 1], Text("... the window is too low for the rest", style="yellow")]
     for one in lines:
@@ -27,6 +33,9 @@ def render(status: Status, width: int, height: int) -> Text:
 def _run(status: RunStatus, width: int, height: int) -> list[Text]:
     badge = Text(f" {plain.voice(status)} ", style="bold black on yellow" if status.transmit else "reverse")
     lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
+    if status.bus.no_bus:
+        told = textwrap.wrap(status.bus.no_bus, max(20, width - 2))
+        lines[2:] = [*(Text(f"  {part}", style="bold red") for part in told[:_ERROR_LINES]), Text()]
     tail = _bus(status, width)
     room = height - len(lines) - len(tail)
     if _BLOCK_LINES * len(status.nodes) + sum(bool(n.encoder) for n in status.nodes) <= room:
@@ -126,7 +135,7 @@ def _bus(status: RunStatus, width: int) -> list[Text]:
     if bus.load > 1.0:
         load = load.replace("%", "% (more than the bit rate carries)", 1)
     lines = [Text.assemble(("bus", "bold"), " " * (_LABEL - 1), load),
-             _labelled("", _counts(plain.bus_troubles(bus)))]
+             _labelled("", _counts(plain.bus_troubles(bus) + [("outages", bus.outages)] * (bus.outages > 0)))]
     if status.transmit:
         unsent = _counts([("unsent", bus.unsent), ("too late", bus.late)])
         lines.append(_labelled("answers", f"turnaround {plain.turnaround(bus)}  ", unsent))

@@ -24,7 +24,8 @@ examples:
   CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
 
 On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.
-exit codes: 0 ended by you or by --duration, 1 the bus went away or a drive sent no samples, 2 bad input
+A bus that goes away (interface down, adapter unplugged) is waited for; --no-reconnect ends the run instead.
+exit codes: 0 ended by you or by --duration, 1 there was no bus at the end or a drive sent no samples, 2 bad input
 """
 
 
@@ -35,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="send estimates, status and injection commands; without it nothing is ever sent")
     parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
     parser.add_argument("--quiet", action="store_true", help="no status while it runs, only the summary")
+    parser.add_argument("--no-reconnect", action="store_true", help="end when the bus goes away")
     bus.add_arguments(parser)
 
 
@@ -46,6 +48,7 @@ def main(args: argparse.Namespace) -> int:
     rates = bus.bit_rates(args, configs)
     bus.check_named(args)
 
+    from ipmsm_can.bus.link import Link
     from ipmsm_can.bus.live import LiveRunner
     from ipmsm_can.bus.warmup import warm_up_companion
     from ipmsm_can.cli.monitor import RunMonitor
@@ -55,10 +58,15 @@ def main(args: argparse.Namespace) -> int:
     protocol = build_protocol(configs)
     with bus.patience():
         warm_up_companion(configs, protocol)
-    with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port:
-        runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates)
+    with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port, \
+            Link(port, lambda: bus.open_bus(args)) as link:
+        runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
+                            None if args.no_reconnect else link)
         monitor = RunMonitor(runner)
         code, status = bus.serve("run", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)
+    if link.down:
+        print(f"ipmsm-can run: there is {link.words}", file=sys.stderr)
+        code = 1
     silent = [runner.companion.nodes[n.node] for n in status.nodes if not n.received]
     if code or not silent:
         return code

@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ipmsm_can.bus.health_report import HealthReport
+
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
@@ -89,6 +91,8 @@ class BusStatus:
     unknown: identifiers that are none of ours.  drops: frames the kernel lost for want of buffer.
     errors: what error frames told, in words; error_frames: how many.
     late: estimates withheld because the program read their samples too late.
+    no_bus: since when and why there is no bus, "" where there is.  outages: how often it went away, outage_time [s]
+    in all.
     """
 
     description: str
@@ -106,6 +110,9 @@ class BusStatus:
     errors: str
     turnaround_p50: float
     turnaround_p99: float
+    no_bus: str = ""
+    outages: int = 0
+    outage_time: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,4 +164,13 @@ class DriveStatus:
     nodes: tuple[DriveNodeStatus, ...]
 
 
-Status = RunStatus | DriveStatus
+@dataclass(frozen=True, slots=True)
+class HealthStatus:
+    """A bus that is listened to.  elapsed [s]."""
+
+    title: str
+    elapsed: float
+    report: HealthReport
+
+
+Status = RunStatus | DriveStatus | HealthStatus
