@@ -107,9 +107,9 @@ class StartUp:
         self._tilt = estimator.settings.uncertainty.tilt
         voltage_uncertainty = estimator.settings.voltage_uncertainty
         self._still_below = 2.0 * voltage_uncertainty
-        # An error of the voltage turns the axis by at most half its share, times what b is smaller than a.  Dead time,
-        # which goes against the current and so across the voltage, comes to that only where a load holds the current
-        # at the dead time's corner.
+        # An error of the voltage turns the axis by at most half its share, times what b is smaller than a.  Dead
+        # time, which goes against the current and so across the voltage, comes to that only where a load holds the
+        # current at the dead time's corner.
         self._turned = 0.4 * voltage_uncertainty * motor.L_s / abs(0.5 * motor.L_0) if motor.L_0 else math.inf
         self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n)
         self._back_emf = 0j

@@ -188,7 +188,9 @@ def test_hand_over_from_standstill_to_speed_and_back(motor: str) -> None:
     assert valid[known].mean() > 0.9
     limit = 6.0 if motor == "m2" else np.maximum(6.0, 2.0 * sigma[valid])
     assert (np.abs(off[valid]) < limit).all()
-    assert np.abs(np.diff(off[known & (t < 4.4)])).max() < 2.0
+    # The start-up may still put it right by as much as it was in doubt; the hand-over, which begins at 0.4 s, not.
+    assert (np.abs(np.diff(off)) < np.maximum(2.0, sigma[:-1]))[known[:-1] & (t[:-1] < 4.4)].all()
+    assert np.abs(np.diff(off[(t > 0.5) & (t < 4.4)])).max() < 2.0
     amplitude = np.concatenate([s.injection_amplitude for s in cosim.recording.truth[0]])
     assert amplitude[round(2.0 * 5000):round(3.0 * 5000)].max() == 0.0
 

@@ -59,7 +59,7 @@ def test_defaults() -> None:
         "adapt_resistance": True, "voltage_delay": "auto",
     }
     assert config.estimate.model_dump() == {
-        "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 10.0,
+        "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 7.5,
     }
     assert config.injection.model_dump() == {
         "enabled": True, "waveform": "auto", "amplitude": 6.0, "frequency": 400.0, "sigma_target": None,

@@ -189,7 +189,8 @@ def test_at_standstill_no_angle_is_claimed() -> None:
 # ---- injection ----------------------------------------------------------------------------------------
 
 def injection(**keys: Any) -> dict[str, Any]:
-    return {"motor": {"preset": "m2"}, "injection": keys}
+    # By speed, which is given; without it the angle's own sigma decides (test_by_sigma).
+    return {"motor": {"preset": "m2"}, "injection": {"speed_on": 40.0, "speed_off": 60.0, **keys}}
 
 
 def test_injection_from_low_speed_to_high() -> None:

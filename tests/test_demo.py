@@ -88,7 +88,8 @@ def test_probing_is_asked_for_and_obeyed_at_low_speed_only() -> None:
     # first the polarity pulses, in vain on a linear machine; then the probing signal alone
     assert 6.0 < record.command_amplitude[record.command_time < 0.5].max() <= 30.0
     assert record.command_amplitude[(record.command_time > 0.5) & (record.command_time < 4.0)].max() <= 6.0
-    assert record.command_amplitude[(record.command_time > 0.5) & (record.command_time < 4.0)].min() > 3.0
+    # never more than is needed, and never nothing
+    assert record.command_amplitude[(record.command_time > 0.5) & (record.command_time < 4.0)].min() > 0.0
     assert not (record.command_time > 7.0).any()
     assert record.frames[MessageKind.INJECTION_COMMAND] == record.command_time.size
 

@@ -31,7 +31,8 @@ from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import CompanionState, InjectionState, MessageKind, Protocol
 
 PROTOCOL = Protocol()
-CONFIG = config_from({"motor": {"preset": "m2"}, "wire": {"sample_rate": 5000.0}})
+CONFIG = config_from({"motor": {"preset": "m2"}, "wire": {"sample_rate": 5000.0},
+                      "injection": {"speed_on": 40.0, "speed_off": 60.0}})
 SECOND = 1_000_000_000
 COMMAND = int(PROTOCOL.base_ids[MessageKind.INJECTION_COMMAND])
 DOWN = BusError(errno.ENETDOWN, "can7 is down; bring it up")

@@ -31,10 +31,10 @@ MODULO_PI = ["injection_extraction", "injection_demodulation"]
 
 
 def settings(kind: str, motor: Motor, **keys: Any) -> EstimatorSettings:
-    """As [observer] of a drive.toml would give them."""
+    """As [observer] of a drive.toml would give them; valid up to 10 deg, as some kinds state wide sigmas."""
     names = ("pole_pairs", "psi_m", "L_d", "L_q", "R", "rated_torque")
     return estimator_settings(config_from({"motor": {n: getattr(motor, n) for n in names},
-                                           "observer": {"kind": kind, **keys}}))
+                                           "observer": {"kind": kind, **keys}, "estimate": {"valid_sigma": 10.0}}))
 
 
 def run(kind: str, machine: Rotating, n: int = 10_000, rate: float = RATE, **keys: Any) -> EstimateBlock:

@@ -224,7 +224,7 @@ def test_other_observers_of_flux_are_started_as_well(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["injection_extraction", "injection_demodulation"])
 def test_an_observer_of_the_axis_is_told_the_pole_and_stays_invalid(kind: str) -> None:
     """Each of their angles comes from one window, and may be off by more than an angle called valid may be."""
-    result = standstill.run(replace(SOFT, observer=kind), 7, 0.3)
+    result = standstill.run(replace(SOFT, observer=kind), 7, 0.3, amplitude=4.2, frequency=400.0)
     assert result.phase is Phase.KNOWN and not result.valid
     assert result.error < 30.0  # on the right pole
 
@@ -331,7 +331,7 @@ def test_a_rotor_that_starts_to_turn_keeps_its_polarity() -> None:
 def test_any_partition_gives_the_same_bits(case: standstill.Case, pause: int, end: Phase,
                                            lost: tuple[int, ...]) -> None:
     """A long pause ends a refusal where it stands, not at the end of the block."""
-    cosim = standstill.cosimulation(case, 9, True, {})
+    cosim = standstill.cosimulation(case, 9, True, {"amplitude": 4.2, "frequency": 400.0})
     cosim.run(0.3)
     samples = np.concatenate([t.run.values for t in cosim.recording.tracked[0]], axis=1)
     node: Any = cosim.companion.nodes[0]
