@@ -390,7 +390,8 @@ class Node:
         found = refused or view.flags & confidence.POLARITY_KNOWN
         return self.scheduler.update(period, view.omega, view.excitation, self._probing_axis, view.hf_current,
                                      self._fresh(now_ns), self.running, self._pulses(), refused,
-                                     view.sigma if found else math.pi, view.flags & confidence.VALID != 0)
+                                     view.sigma if found else math.pi, view.flags & confidence.VALID != 0,
+                                     view.flags & confidence.LOCKED != 0)
 
     def _pulses(self) -> Command | None:
         wanted = None if self.startup is None else self.startup.pulses

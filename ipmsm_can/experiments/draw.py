@@ -195,7 +195,8 @@ def _share(values: Floats, span: tuple[float, float], log: bool) -> Floats:
     if log:
         values = np.log10(np.maximum(values, 1e-300))
         low, high = math.log10(low), math.log10(high)
-    return np.asarray((values - low) / (high - low))
+    # Where all values are one, they stand in the middle.
+    return np.asarray((values - low) / (high - low) if high > low else np.full(np.shape(values), 0.5))
 
 
 def _span(parts: list[Floats], log: bool, room: float) -> tuple[float, float]:

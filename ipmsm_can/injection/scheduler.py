@@ -120,7 +120,8 @@ class InjectionScheduler:
 
     def update(self, elapsed: float, omega: float, excitation: float, theta: float, current: float,
                fresh: bool, running: bool = True, pulses: Command | None = None,
-               unknowable: bool = False, sigma: float = math.pi, valid: bool = False) -> Command | None:
+               unknowable: bool = False, sigma: float = math.pi, valid: bool = False,
+               locked: bool = True) -> Command | None:
         """Decide for the next period; returns the command to send, None for silence.
 
         elapsed: time since the last call [s].  omega [rad/s electrical], excitation [V^2 s], theta [rad
@@ -128,12 +129,12 @@ class InjectionScheduler:
         are coming in.  running: the inverter applies the voltage it reports, as far as is known.
         pulses: polarity pulses, asked for instead of the waveform where that may be injected.  unknowable: the
         polarity was asked for in vain.  sigma: 1-sigma of the angle [rad electrical], pi = unknown, or still to be
-        found by the start-up.  valid: the angle is.
+        found by the start-up.  valid: the angle is.  locked: the observer is; before, omega says nothing.
         """
         s = self.settings
         if self.state is InjectionState.DISABLED:
             return None
-        reason = self._decide(abs(omega), excitation, fresh, running, sigma, elapsed)
+        reason = self._decide(abs(omega), excitation, fresh, running, sigma, elapsed, locked)
         if pulses is not None and self._wanted:
             self._off_left = OFF_REPEATS
             self._settling = SETTLING
@@ -173,7 +174,7 @@ class InjectionScheduler:
         return None
 
     def _decide(self, speed: float, excitation: float, fresh: bool, running: bool,
-                sigma: float, elapsed: float) -> InjectionReason:
+                sigma: float, elapsed: float, locked: bool) -> InjectionReason:
         s = self.settings
         by_excitation = s.excitation_off > 0.0
         if not fresh:
@@ -197,7 +198,7 @@ class InjectionScheduler:
             if by_excitation and excitation < s.excitation_on:
                 self._wanted = True
                 return InjectionReason.POOR_EXCITATION
-        elif speed > s.speed_off and not (by_excitation and excitation < s.excitation_off):
+        elif locked and speed > s.speed_off and not (by_excitation and excitation < s.excitation_off):
             self._wanted = False
             return InjectionReason.SPEED_HIGH_ENOUGH
         return self.reason
