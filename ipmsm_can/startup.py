@@ -44,6 +44,9 @@ _MODEL_SIGMA = math.radians(1.0)
 """What the axis of a window may be wrong by besides noise and voltage: saturation, inductances."""
 _DRIFT_SIGMA = math.radians(1.0)
 """What the rotor may move in a window while it stands still."""
+_LOADED = 0.1
+"""Share of rated current across the axis from which on pulses tell nothing: it brings the iron past its knee, where
+it bends the other way."""
 _JUMP = math.radians(30.0)
 _AXIS_WINDOWS = 3
 _COHERENT = 0.9
@@ -277,7 +280,8 @@ class StartUp:
             return
         if self._window["broken"][0]:
             return
-        self.evidence.add(*polarity.curvature(self._window, self._noise))
+        if polarity.load(self._window) < _LOADED * self._motor.rated_current:
+            self.evidence.add(*polarity.curvature(self._window, self._noise))
         self._aim(float(self._window["peak"][0]), float(self._window["voltage"][0]))
         verdict = self.evidence.verdict
         if verdict is Verdict.EQUAL:

@@ -190,7 +190,8 @@ def test_at_standstill_no_angle_is_claimed() -> None:
 
 def injection(**keys: Any) -> dict[str, Any]:
     # By speed, which is given; without it the angle's own sigma decides (test_by_sigma).
-    return {"motor": {"preset": "m2"}, "injection": {"waveform": "rotating", "speed_on": 40.0, "speed_off": 60.0, **keys}}
+    by_speed = {"waveform": "rotating", "speed_on": 40.0, "speed_off": 60.0}
+    return {"motor": {"preset": "m2"}, "injection": {**by_speed, **keys}}
 
 
 def test_injection_from_low_speed_to_high() -> None:

@@ -157,7 +157,7 @@ def test_evidence_decides_by_its_own_uncertainty() -> None:
             evidence = Evidence(M2, M2.rated_current)
             c = true * M2.rated_current / 2.0
             while evidence.verdict is Verdict.OPEN:
-                evidence.add(c + 0.04 * rng.standard_normal(), 0.04**2)
+                evidence.add(c + 0.03 * rng.standard_normal(), 0.03**2)
             verdicts.setdefault(true, []).append(evidence.verdict)
     assert set(verdicts[0.07]) == {Verdict.NORTH}
     assert set(verdicts[-0.07]) == {Verdict.SOUTH}
@@ -403,3 +403,22 @@ def test_the_words_are_in_the_database() -> None:
     back, _, _ = protocol.decode(MessageKind.COMPANION_STATUS, 0, raw, np.zeros(1, np.intp))
     assert back[codec.index["injection_state"], 0] == 6 and back[codec.index["injection_reason"], 0] == 11
     assert Companion([config_from({"motor": {"preset": "m1"}})], protocol, True).nodes[0].startup is None
+
+
+def test_an_asymmetry_that_needs_many_windows_is_not_believed() -> None:
+    evidence = Evidence(M2, M2.rated_current)
+    for _ in range(200):
+        evidence.add(0.1 * M2.rated_current / 2.0, (0.1 * M2.rated_current / 2.0) ** 2)  # one sigma each
+        assert evidence.verdict in (Verdict.OPEN, Verdict.EQUAL)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_pulses_under_load_tell_nothing(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Across the axis the load brings the iron past its knee, where it bends the other way."""
+    cosim = standstill.cosimulation(HARD, 3, True, {})
+    node: Any = cosim.companion.nodes[0]
+    while node.startup is None or node.startup.phase is not Phase.PULSES:
+        cosim.run(0.005)
+    monkeypatch.setattr(polarity, "load", lambda window: share * M2.rated_current)
+    cosim.run(0.3)
+    assert (node.startup.phase is Phase.KNOWN) == (share == 0.0)

@@ -44,6 +44,8 @@ SIGNIFICANT = 6.0
 LEAST_ASYMMETRY = 0.03
 RESOLVED = 0.005
 LEAST_WINDOWS = 4
+MOST_WINDOWS = 24
+"""An asymmetry that only more windows than these bring out of the noise is as likely one of the samples."""
 _TERMS = 4
 _ALIEN = 2.5
 """How far the saliency seen may be off the motor's, either way, for the axis to be believed."""
@@ -252,5 +254,7 @@ class Evidence:
             return Verdict.OPEN
         a, sigma = self.asymmetry, self.sigma
         if abs(a) > max(SIGNIFICANT * sigma, LEAST_ASYMMETRY):
+            if self.windows > MOST_WINDOWS:
+                return Verdict.OPEN
             return Verdict.NORTH if a > 0.0 else Verdict.SOUTH
         return Verdict.EQUAL if sigma < RESOLVED else Verdict.OPEN
