@@ -38,7 +38,8 @@ from ipmsm_can.wire.protocol import (
     Waveform,
 )
 from ipmsm_can.wire.receive import SampleReceiver
-from ipmsm_can.wire.sequence import CLIPPED, SampleRun
+from ipmsm_can.wire.sequence import SampleRun
+from ipmsm_can.wire.sequence_kernel import CLIPPED
 
 STALE_AFTER_NS = 50_000_000
 """Silence of the drive [ns] after which nothing is claimed any more."""

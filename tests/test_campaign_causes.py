@@ -16,7 +16,8 @@ from ipmsm_can.estimation.estimator import Estimator
 from ipmsm_can.estimation.observers import common, riccati, voltage_errors
 from ipmsm_can.motor import M2
 from ipmsm_can.startup import _Turning
-from ipmsm_can.wire.sequence import FILLED_S, NIBBLE, TIMING, Events, SampleSequencer
+from ipmsm_can.wire.sequence import Events, SampleSequencer
+from ipmsm_can.wire.sequence_kernel import FILLED_S, NIBBLE, TIMING
 
 RATE = 5000.0
 

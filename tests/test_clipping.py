@@ -22,7 +22,7 @@ from ipmsm_can.node import Tracked
 from ipmsm_can.wire.dbc import Database, default_dbc_path
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 from ipmsm_can.wire.receive import AXES, SampleReceiver
-from ipmsm_can.wire.sequence import CLIPPED
+from ipmsm_can.wire.sequence_kernel import CLIPPED
 
 PROTOCOL = Protocol()
 RATE = 5000.0

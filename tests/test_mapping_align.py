@@ -14,7 +14,7 @@ from ipmsm_can.frames import FrameBlock
 from ipmsm_can.mapping import InverterMap
 from ipmsm_can.mapping.convert import ANGLE_APART, CURRENT_APART, OTHER_APART
 from ipmsm_can.mapping.plan import ANGLE, I_1, V_DC
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 from tests.mapping_traffic import dbc_text, frames, make_map, run, same
 
 FLOAT = '{name} : {start}|32@1- (1,0) [0|0] ""'

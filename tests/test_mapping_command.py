@@ -20,7 +20,7 @@ from ipmsm_can.mapping.load import map_folder
 from ipmsm_can.mapping.survey import Survey
 from ipmsm_can.mapping.track import MappedTracking
 from ipmsm_can.wire.protocol import Protocol
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 from tests.mapping_traffic import dbc_text, run
 from tests.replaying import column, config, drive_frames, toml
 from tests.test_mapping_drives import cascadia

@@ -421,4 +421,5 @@ def test_pulses_under_load_tell_nothing(share: float, monkeypatch: pytest.Monkey
         cosim.run(0.005)
     monkeypatch.setattr(polarity, "load", lambda window: share * M2.rated_current)
     cosim.run(0.3)
-    assert (node.startup.phase is Phase.KNOWN) == (share == 0.0)
+    ended: Phase = node.startup.phase
+    assert (ended is Phase.KNOWN) == (share == 0.0)

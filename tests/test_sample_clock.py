@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipmsm_can.bus.replay import SampleClock
-from ipmsm_can.wire.sequence import RESTARTED, SampleRun
+from ipmsm_can.wire.sequence import SampleRun
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 
 def run_of(counter: list[int], gap: list[int] | None = None, t_ms: list[float] | None = None,

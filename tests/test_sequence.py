@@ -9,17 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipmsm_can.wire.sequence import (
-    FILLED_S,
-    FULL,
-    NIBBLE,
-    PENDING_MAX,
-    RESTARTED,
-    TIMING,
-    Events,
-    SampleRun,
-    SampleSequencer,
-)
+from ipmsm_can.wire.sequence import PENDING_MAX, Events, SampleRun, SampleSequencer
+from ipmsm_can.wire.sequence_kernel import FILLED_S, FULL, NIBBLE, RESTARTED, TIMING
 
 RATE = 5000.0
 PERIOD_NS = int(1e9 / RATE)

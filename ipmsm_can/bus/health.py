@@ -20,7 +20,7 @@ from ipmsm_can.bus.health_words import judge
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, FrameBlock
 from ipmsm_can.wire.protocol import NODES, MessageKind, Protocol
 from ipmsm_can.wire.receive import SampleReceiver
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 _STEADY = 0.8
 _NO_ROWS = np.zeros(0, np.intp)

@@ -24,7 +24,7 @@ from ipmsm_can.wire.e2e import crc_p02
 from ipmsm_can.wire.kernels import decode_block, encode_block
 from ipmsm_can.wire.protocol import PROTOCOL_VERSION, DriveMode
 from ipmsm_can.wire.receive import is_clipped
-from ipmsm_can.wire.sequence import NIBBLE, SEQUENCED, TIMING, sequence
+from ipmsm_can.wire.sequence_kernel import NIBBLE, SEQUENCED, TIMING, sequence
 
 MOST = 64
 """Frames that one receive takes at most."""

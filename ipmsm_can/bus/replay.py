@@ -21,7 +21,8 @@ from ipmsm_can.estimation.observers import ges
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_SFF_MASK, FrameBlock
 from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import NODES, MessageKind, Protocol
-from ipmsm_can.wire.sequence import LONGEST_SILENCE, RESTARTED, SampleRun
+from ipmsm_can.wire.sequence import SampleRun
+from ipmsm_can.wire.sequence_kernel import LONGEST_SILENCE, RESTARTED
 
 TIMING_WITHIN_NS = 2_000_000_000
 """A drive.toml's sample_rate counts only if the log has no DriveTiming of the drive within this time."""

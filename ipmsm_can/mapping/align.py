@@ -29,7 +29,7 @@ from ipmsm_can.mapping.plan import (
     OMEGA,
     RATE,
 )
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,7 +9,7 @@ from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK
 from ipmsm_can.mapping.convert import QUALITY
 from ipmsm_can.mapping.plan import CONSTANT, COUNTER, OMEGA, RATE, Channel
 from ipmsm_can.mapping.survey import SignalFigures, Survey
-from ipmsm_can.wire.sequence import RATE_MIN
+from ipmsm_can.wire.sequence_kernel import RATE_MIN
 
 SAMPLES_PER_TURN = 12
 """Samples per electrical turn that the fast observer needs; docs/mapping.md has what was measured."""

@@ -13,7 +13,7 @@ from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, FrameBloc
 from ipmsm_can.mapping.convert import ANGLE_APART, QUALITY, spoils_dq
 from ipmsm_can.mapping.mapper import MappedBlock, Mapper
 from ipmsm_can.mapping.plan import Plan
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

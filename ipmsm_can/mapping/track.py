@@ -19,7 +19,7 @@ from ipmsm_can.estimation.observers import ges
 from ipmsm_can.mapping.convert import ANGLE_APART, CURRENT_APART, VOLTAGE_APART
 from ipmsm_can.mapping.mapper import MappedBlock
 from ipmsm_can.mapping.model import InverterMap
-from ipmsm_can.wire.sequence import RESTARTED
+from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

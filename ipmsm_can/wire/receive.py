@@ -17,7 +17,8 @@ from ipmsm_can.wire.codec import MessageCodec
 from ipmsm_can.wire.e2e import E2EStatus, SequenceChecker
 from ipmsm_can.wire.kernels import FLOAT, KIND
 from ipmsm_can.wire.protocol import BLOCK_SAMPLES, MessageKind, Protocol
-from ipmsm_can.wire.sequence import CLIPPED, DUPLICATES, FULL, NIBBLE, TIMING, Events, SampleRun, SampleSequencer
+from ipmsm_can.wire.sequence import Events, SampleRun, SampleSequencer
+from ipmsm_can.wire.sequence_kernel import CLIPPED, DUPLICATES, FULL, NIBBLE, TIMING
 
 Rows = NDArray[np.intp]
 Floats = NDArray[np.float64]
