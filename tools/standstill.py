@@ -31,7 +31,7 @@ from ipmsm_can.startup import Phase
 from ipmsm_can.wire.protocol import Protocol, Waveform
 
 RATE = 5000.0
-PROBING: dict[str, dict[str, Any]] = {"m1": {"amplitude": 21.0, "frequency": "auto", "ramp": 200.0},
+PROBING: dict[str, dict[str, Any]] = {"m1": {"amplitude": 20.0, "frequency": "auto", "ramp": 200.0},
                                       "m2": {"amplitude": 8.4, "frequency": "auto"}}
 """Amplitude [V peak] that keeps the continuous probing current below 15 % of rated; the default, 6 V, does not
 on m2."""
