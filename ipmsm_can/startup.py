@@ -44,8 +44,8 @@ _MODEL_SIGMA = math.radians(1.0)
 """What the axis of a window may be wrong by besides noise and voltage: saturation, inductances."""
 _DRIFT_SIGMA = math.radians(1.0)
 """What the rotor may move in a window while it stands still."""
-_LOADED = 0.1
-"""Share of rated current across the axis from which on pulses tell nothing: it brings the iron past its knee, where
+_LOADED = 0.05
+"""Share of rated current from which on pulses tell nothing: across the axis it brings the iron past its knee, where
 it bends the other way."""
 _JUMP = math.radians(30.0)
 _AXIS_WINDOWS = 3
