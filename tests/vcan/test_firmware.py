@@ -49,7 +49,8 @@ def program() -> str:
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     path = tmp_path / "drive.toml"
-    path.write_text('[motor]\npreset = "m2"\n')
+    # Probing by speed: by its own sigma the angle would need none at the speeds below.
+    path.write_text('[motor]\npreset = "m2"\n[injection]\nwaveform = "rotating"\nspeed_on = 40\nspeed_off = 60\n')
     return path
 
 
