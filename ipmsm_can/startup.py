@@ -42,15 +42,14 @@ _AXIS_SIGMA = math.radians(7.0)
 _WINDOW_SIGMA = math.radians(15.0)
 _MODEL_SIGMA = math.radians(1.0)
 """What the axis of a window may be wrong by besides noise and voltage: saturation, inductances."""
-_DRIFT_SIGMA = math.radians(1.0)
-"""What the rotor may move in a window while it stands still."""
+_ASTRAY = math.radians(20.0)
+"""1-sigma beyond which a window's axis could come back on the wrong branch."""
 _LOADED = 0.05
 """Share of rated current from which on pulses tell nothing: across the axis it brings the iron past its knee, where
 it bends the other way."""
 _JUMP = math.radians(30.0)
 _AXIS_WINDOWS = 3
 _COHERENT = 0.9
-_LEAST_LINE = 3
 _PULSES_S = 0.4
 _PAUSE_S = 1.0
 _TRIES = 3
@@ -114,7 +113,10 @@ class StartUp:
         # time, which goes against the current and so across the voltage, comes to that only where a load holds the
         # current at the dead time's corner.
         self._turned = 0.4 * voltage_uncertainty * motor.L_s / abs(0.5 * motor.L_0) if motor.L_0 else math.inf
-        self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n)
+        self._window = polarity.new_state(motor, rate, self.evidence.unit, self.n,
+                                          estimator.settings.inductance_uncertainty)
+        # 1-sigma of the speed [rad/s electrical] of a rotor that counts as standing.
+        self._creep = voltage_uncertainty / motor.psi_m
         self._back_emf = 0j
         self._count = 0
         self._wasted = 0
@@ -122,7 +124,6 @@ class StartUp:
         self._tries = 0
         self._lost = 0
         self._last_peak = self._raised = 0.0
-        self._turning = _Turning()
         self._begin_axis()
 
     @property
@@ -203,7 +204,10 @@ class StartUp:
     def _interrupt(self, missing: int) -> None:
         """Samples are missing: what was gathered so far does not go on behind the gap."""
         self._begin_window()
-        if missing > FORGET_AFTER * self._rate or (missing < 0 and self.phase is not Phase.REFUSED):
+        self.sigma = math.hypot(self.sigma, self._creep * abs(missing) / self._rate)
+        redated = missing < 0 and self.phase is not Phase.REFUSED
+        astray = self.phase is Phase.KNOWN and self.sigma > _ASTRAY
+        if missing > FORGET_AFTER * self._rate or redated or astray:
             self._to(Phase.WATCH)
         elif self.phase in (Phase.AXIS, Phase.PULSES):
             self._to(Phase.AXIS)
@@ -223,7 +227,9 @@ class StartUp:
         load = polarity.load(self._window)
         driven = max(load, float(self._window["peak"][0])) if self.phase is Phase.PULSES else load
         tilt = self._tilt * load * driven / self._motor.rated_current**2
-        sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, self._turned / max(float(self._window["voltage"][0]), 1e-9))
+        turned = self._turned / max(float(self._window["voltage"][0]), 1e-9)
+        # A window tells where the axis was in its middle.
+        sigma = math.hypot(sigma, _MODEL_SIGMA, tilt, turned, 0.5 * self._creep * self.n / self._rate)
         broken = bool(self._window["broken"][0])
         if not broken:
             self._back_emf += 0.25 * (polarity.back_emf(self._window, theta, self._motor) - self._back_emf)
@@ -237,7 +243,6 @@ class StartUp:
                 self._begin_axis()
         elif self.phase is Phase.PULSES:
             self._track(theta, sigma)
-            self._turning.add(self.angle, theta, sigma)
             self._judge_pulses(still)
             self._look_along(self.angle)  # the pulses show the axis much better than what went before
         else:
@@ -259,9 +264,9 @@ class StartUp:
         """Follow the axis from window to window on its branch; returns the window's angle, None if not believed.
 
         What windows are wrong by besides noise they have in common, so the angle never counts as better than the
-        best of them.
+        best of them.  The rotor may creep on meanwhile, always the same way.
         """
-        self.sigma = math.hypot(self.sigma, _DRIFT_SIGMA)
+        self.sigma += self._creep * self.n / self._rate
         off = math.remainder(theta - self.angle, math.pi)
         if not (sigma < _WINDOW_SIGMA and abs(off) < _JUMP):
             return None
@@ -287,12 +292,10 @@ class StartUp:
         if verdict is Verdict.EQUAL:
             self._to(Phase.REFUSED)
         elif verdict is not Verdict.OPEN:
-            angle, sigma = self._turning.now
-            if not sigma < _AXIS_SIGMA:
+            if not self.sigma < _AXIS_SIGMA:
                 return  # of which end is north there is no doubt, but where it is now nobody knows yet
             if verdict is Verdict.SOUTH:
-                angle += math.pi
-            self.angle, self.sigma = math.remainder(angle, 2.0 * math.pi), sigma
+                self.angle = math.remainder(self.angle + math.pi, 2.0 * math.pi)
             self._to(Phase.KNOWN)
             self.estimator.take_angle(self.angle, self.sigma)
 
@@ -333,7 +336,6 @@ class StartUp:
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
             self._last_peak = self._raised = 0.0
             self._windows_left = round(_PULSES_S * self._rate / self.n)
-            self._turning = _Turning()
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0
 
@@ -343,50 +345,6 @@ class StartUp:
 
     def _begin_axis(self) -> None:
         self._axis_windows, self._axis_weight, self._axis_sum = 0, 0.0, 0j
-
-
-class _Turning:
-    """A straight line through the axes of successive windows: a rotor that turns too slowly for its back-EMF to
-    show moves by tens of degrees while it is looked at."""
-
-    def __init__(self) -> None:
-        self._n = 0
-        self._sums = np.zeros((2, 2))
-        self._right = np.zeros(2)
-        self._square = self._weight = 0.0
-        self._common2 = math.inf
-        self._last = 0.0
-
-    def add(self, near: float, theta: float, sigma: float) -> None:
-        """Take in a window's axis, modulo pi, on the branch next to `near`."""
-        self._n += 1
-        if not math.isfinite(sigma):
-            return
-        if not self._weight:
-            self._last = near
-        angle = self._last + math.remainder(theta - self._last, math.pi)
-        self._last = angle
-        row = np.array([1.0, self._n])
-        self._sums += np.outer(row, row) / sigma**2
-        self._right += row * angle / sigma**2
-        self._square += angle**2 / sigma**2
-        self._weight += 1.0
-        self._common2 = min(self._common2, sigma**2)
-
-    @property
-    def now(self) -> tuple[float, float]:
-        """Angle at the end of the last window and its 1-sigma [rad electrical]: inf with fewer than three windows.
-
-        What the windows are wrong by besides noise they have in common, so the 1-sigma of the best of them stands
-        beside that of the line.
-        """
-        if self._weight < _LEAST_LINE:
-            return 0.0, math.inf
-        inverse = np.linalg.inv(self._sums)
-        fit = inverse @ self._right
-        scatter = max((self._square - float(self._right @ fit)) / (self._weight - 2.0), 1.0)
-        row = np.array([1.0, self._n + 0.5])
-        return float(row @ fit), math.sqrt(scatter * float(row @ inverse @ row) + self._common2)
 
 
 def pulse_period(motor: Motor, settings: StartUpSettings, sample_rate: float) -> int:

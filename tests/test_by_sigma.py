@@ -204,6 +204,25 @@ def test_a_valid_angle_is_probed_along_d_and_that_makes_next_to_no_torque() -> N
     assert fixed.ripple > 0.01 * PRESETS["m1"].rated_torque
 
 
+def test_a_moment_without_valid_does_not_change_the_waveform() -> None:
+    """Another waveform begins from nothing, which makes sigma larger still: it would go to and fro."""
+    scheduler = InjectionScheduler(injection_settings(settings(), 5000.0), transmit=True)
+
+    def ask(valid: bool, times: int, sigma: float = 0.1) -> Waveform:
+        for _ in range(times):
+            command = scheduler.update(PERIOD, 0.0, 0.0, 0.3, 0.0, True, sigma=sigma, valid=valid)
+        assert command is not None
+        return command.waveform
+
+    assert ask(False, 30) is Waveform.ROTATING
+    assert ask(True, 3) is Waveform.PULSATING
+    assert ask(False, round(0.08 / PERIOD)) is Waveform.PULSATING
+    assert ask(True, 3) is Waveform.PULSATING
+    assert ask(False, round(0.14 / PERIOD)) is Waveform.ROTATING
+    assert ask(True, 3) is Waveform.ROTATING, "rotating showed the axis no worse: there it stays"
+    assert ask(True, 3, 0.05) is Waveform.PULSATING
+
+
 def test_the_amplitude_settles_where_sigma_meets_the_target() -> None:
     """Less than the whole amplitude does, and it stays there."""
     track = Profile(((0.0, 0.0),), duration=8.0)

@@ -68,6 +68,26 @@ def test_the_axis_of_a_linear_machine_is_exact_for_pulses_along_any_direction(mo
         assert 0.0 < sigma < math.radians(1.0)
 
 
+def test_pulses_beside_the_axis_with_inductances_told_wrong() -> None:
+    """The pulses lag behind a rotor that creeps: the error of L_s then turns the axis seen, and sigma says so."""
+    spread, off, ratio = 0.06, [], []
+    for l_d, l_q in ((0.9, 0.9), (1.1, 1.1), (0.9, 1.0), (1.0, 1.1), (1.1, 0.95)):
+        told = replace(M1, L_d=l_d * M1.L_d, L_q=l_q * M1.L_q)
+        for beside in (-0.17, 0.0, 0.17):
+            samples = pulses(M1, 0.0, 0.5, 0.5 + beside, 2 * PERIOD)
+            state = polarity.new_state(told, RATE, 0.01, samples.shape[1], spread)
+            polarity.window_block(samples, np.zeros(samples.shape[1], np.uint8), state)
+            angle, sigma = polarity.axis(state, 1e-3)
+            error = abs(math.remainder(angle - 0.5, math.pi))
+            if beside:
+                off.append(error)
+                ratio.append(error / sigma)
+            else:
+                assert error < math.radians(0.5) and sigma < math.radians(1.0)
+    assert max(off) < 0.6 * 0.17, "it was once as far off as the pulses are, and more"
+    assert max(ratio) < 2.5
+
+
 def test_the_axis_has_the_error_it_says() -> None:
     off, sigmas = [], []
     for seed in range(200):

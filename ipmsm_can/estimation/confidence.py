@@ -33,7 +33,11 @@ That is the theory of `ges`; of the other observers it describes
                           An observer that loses its lock again and again does not describe the machine, and its
                           covariance cannot be believed: each loss keeps `valid` off for longer
                           Added here is whether the speed is plausible: |Phi| against that of a rotor that turns as
-                          fast as the angle does
+                          fast as the angle does.
+                          While the rotor turns, what is wrong with voltage and motor data points everywhere in
+                          turn, and 2 sigma are rarely passed; at standstill all of it may stay at its worst and point the
+                          same way, 3 sigma and more.  So an angle has to be surer to become valid there than to
+                          stay so
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
                           is added.  They see an axis, not its north: polarity is not known unless `take_angle`
                           has told them; and none of their angles is valid, for a single window may be far off
@@ -74,6 +78,11 @@ _FORGIVEN = 1.0
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
+_SLOW_SHARE = 0.6
+"""Share of the largest valid 1-sigma at which an angle becomes valid at standstill, and _FAST_EMF: back-EMF over
+the voltage's uncertainty from which on it does at all of it."""
+_FAST_EMF = 8.0
+
 LOCKED = 1
 POLARITY_KNOWN = 2
 VALID = 4
@@ -87,8 +96,8 @@ STATE = np.dtype([
     ("own", "i8"), ("L_0", "f8"), ("volts", "f8"),
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
-    # riccati: losses of lock that are not yet forgotten, and for how long [s] nothing is valid.
-    ("losses", "f8"), ("probation", "f8"),
+    # riccati: losses of lock that are not yet forgotten, for how long [s] nothing is valid, and what was said last.
+    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"),
 ])
 
 
@@ -131,7 +140,7 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
 
 def forget(state: NDArray[np.void]) -> None:
     """Give up lock, polarity and covariance: the next sample starts from nothing."""
-    for name in ("started", "test", "contraction", "locked", "polarity"):
+    for name in ("started", "test", "contraction", "locked", "polarity", "valid"):
         state[name] = 0
 
 
@@ -217,6 +226,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     lost = st.lost
     losses = st.losses
     probation = st.probation
+    valid = st.valid
     for k in range(flux.shape[1]):
         s = flux[5, k]
         opinion = int(flux[6, k])
@@ -244,13 +254,17 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             locked = 1
         polarity = 1 if opinion & POLARITY else 0
         sigma[k] = s
-        valid = locked and polarity and s <= st.sigma_limit and probation == 0.0
+        limit = st.sigma_limit
+        if not valid and st.psi_m * abs(omega) < _FAST_EMF * st.volts:
+            limit *= _SLOW_SHARE + (1.0 - _SLOW_SHARE) * st.psi_m * abs(omega) / (_FAST_EMF * st.volts)
+        valid = 1 if locked and polarity and s <= limit and probation == 0.0 else 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
     st.test = test
     st.locked = locked
     st.lost = lost
     st.losses = losses
     st.probation = probation
+    st.valid = valid
 
 
 @kernel

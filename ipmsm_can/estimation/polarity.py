@@ -9,6 +9,11 @@ Axis, with complex space vectors as in `observers.probing`, a = L_s/(L_d L_q) fr
 
     i - a lambda = c_0 + c_1 tau + b conj(lambda),    b = -(L_0/2) exp(2j theta)/(L_d L_q),    theta modulo pi
 
+L_s and L_0 are not known exactly.  An error da of a adds da times the share of the flux that swings along one
+line, M = sum lambda^2/sum |lambda|^2, to b: nothing while the probing signal rotates, but pulses beside the axis,
+as they are where the rotor turns meanwhile, turn the axis seen by as much again.  How long b is tells da, as far as
+L_0 is known better; what is left of da is part of the 1-sigma.
+
 North, with the parts of current and flux along that axis: flux along +d adds to the magnet's and drives the iron
 into saturation, flux along -d relieves it, so the d current is a bent function of the d flux,
 
@@ -32,6 +37,7 @@ from __future__ import annotations
 import cmath
 import math
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +60,15 @@ _ASTRAY = 0.3
 other waveforms the flux across saturates the axis most where that along it is least."""
 
 STATE = np.dtype([
-    ("T_s", "f8"), ("R", "f8"), ("mean", "f8"), ("difference", "f8"), ("unit", "f8"), ("n", "i8"),
+    ("T_s", "f8"), ("R", "f8"), ("mean", "f8"), ("difference", "f8"), ("mean_spread", "f8"), ("unit", "f8"),
+    ("n", "i8"),
     # pulse axis as a unit vector
     ("axis", "c16"),
     ("count", "i8"), ("broken", "i8"), ("started", "i8"),
     ("i", "c16"), ("first", "c16"), ("flux", "c16"), ("sum", "c16"),
     # normal equations of the axis and of the bend
     ("axis_normal", "c16", (3, 3)), ("axis_right", "c16", (3,)), ("axis_square", "f8"),
+    ("line_square", "c16"), ("line_sum", "c16"),
     ("normal", "f8", (_TERMS, _TERMS)), ("right", "f8", (_TERMS,)), ("square", "f8"),
     # swing of the flux along and across, largest current and voltage
     ("along_low", "f8"), ("along_high", "f8"), ("across_low", "f8"), ("across_high", "f8"),
@@ -78,12 +86,15 @@ class Verdict(IntEnum):
     EQUAL = 2
 
 
-def new_state(motor: Motor, sample_rate: float, unit: float, n: int) -> NDArray[np.void]:
-    """Record array (1,) of STATE; sample_rate [Hz]; unit: flux [Wb] that f is counted in; n: of a window."""
+def new_state(motor: Motor, sample_rate: float, unit: float, n: int, spread: float = 0.0) -> NDArray[np.void]:
+    """Record array (1,) of STATE; sample_rate [Hz]; unit: flux [Wb] that f is counted in; n: of a window; spread:
+    1-sigma of L_d and of L_q as a share of them."""
     state = np.zeros(1, STATE)
     product = motor.L_d * motor.L_q
     for name, value in {"T_s": 1.0 / sample_rate, "R": motor.R, "mean": motor.L_s / product,
-                        "difference": 0.5 * motor.L_0 / product, "unit": unit, "n": n, "axis": 1.0}.items():
+                        "difference": 0.5 * motor.L_0 / product, "unit": unit, "n": n, "axis": 1.0,
+                        "mean_spread": 0.5 * spread * math.hypot(1.0 / motor.L_d, 1.0 / motor.L_q),
+                        }.items():
         state[name] = value
     return state
 
@@ -129,6 +140,8 @@ def window_block(samples: NDArray[np.float64], filled: NDArray[np.uint8], state:
             for c in range(3):
                 st.axis_normal[r, c] += axis_row[r].conjugate() * axis_row[c]
             st.axis_right[r] += axis_row[r].conjugate() * y
+        st.line_square += st.flux * st.flux
+        st.line_sum += st.flux
         st.axis_square += y.real * y.real + y.imag * y.imag
 
         along = (st.flux * back).real
@@ -167,7 +180,26 @@ def axis(state: NDArray[np.void], noise: float) -> tuple[float, float]:
     b = complex(fit[2])
     if not (math.isfinite(variance) and variance > 0.0 and 1.0 / _ALIEN < abs(b) / model < _ALIEN):
         return 0.0, math.inf
-    return 0.5 * cmath.phase(b if st["difference"] < 0.0 else -b), 0.5 * math.sqrt(variance) / model
+    b, doubt = _cleared(b, model, st)
+    sigma = 0.5 * math.hypot(math.sqrt(variance) / model, doubt)
+    return 0.5 * cmath.phase(b if st["difference"] < 0.0 else -b), sigma
+
+
+def _cleared(b: complex, model: float, st: Any) -> tuple[complex, float]:
+    """b without what a wrong L_s makes of a flux that swings along one line, and the 1-sigma of twice the angle
+    [rad] that this leaves.  a and |b| are wrong by the same 1-sigma, as 1/L_d and 1/L_q are (half of their sum and
+    of their difference)."""
+    spread = float(st["mean_spread"]) * float(st["unit"])
+    count, mean = float(st["axis_normal"][0, 0].real), complex(st["line_sum"])
+    swing = float(st["axis_normal"][2, 2].real) - abs(mean) ** 2 / count
+    if not (spread > 0.0 and swing > 0.0):
+        return b, 0.0
+    line = (complex(st["line_square"]) - mean * mean / count) / swing
+    line *= min(1.0, 1.0 / max(abs(line), 1e-12))
+    seen = (line * b.conjugate()).real / abs(b)
+    cleared = b - seen * (abs(b) - model) / (1.0 + seen * seen) * line
+    across = abs((line * cleared.conjugate()).imag) / max(abs(cleared), 1e-12)
+    return cleared, across * spread / (math.sqrt(1.0 + seen * seen) * max(abs(cleared), 0.5 * model))
 
 
 def load(state: NDArray[np.void]) -> float:

@@ -20,6 +20,8 @@ SETTLING = 0.06
 """How long after polarity pulses the measured current is not that of the waveform [s]."""
 ASTRAY = math.radians(20.0)
 """1-sigma [rad electrical] beyond which the d-axis is not known well enough to probe along it."""
+_PATIENCE = 0.1
+"""How long the angle may be valid no more before another waveform is tried, which begins from nothing [s]."""
 _ROOM = 0.6
 _RECOVERY = 0.1
 """Share of the way back to full amplitude per second once the current is below its limit again."""
@@ -78,7 +80,7 @@ class InjectionScheduler:
         self.amplitude = 0.0
         self._wanted = False
         self._share = 1.0
-        self._along, self._along_below = False, math.pi
+        self._along, self._along_below, self._unsure = False, math.pi, 0.0
         self._rule = SigmaRule(settings.sigma_target, settings.emf_speed, settings.floor / settings.amplitude)
         self._off_left = 0
         self._settling = 0.0
@@ -162,10 +164,11 @@ class InjectionScheduler:
         if self.amplitude > 0.0:
             self._off_left = OFF_REPEATS
             axis = theta if s.axis is None else s.axis
-            if self._along and not valid:
+            self._unsure = 0.0 if valid else self._unsure + elapsed
+            if self._along and (sigma > ASTRAY or self._unsure > _PATIENCE):
                 # Rotating shows the axis somewhat better; back only where there is room, or it would go to and fro.
                 self._along, self._along_below = False, _ROOM * min(sigma, ASTRAY)
-            self._along = s.along_d and not asked and valid and (self._along or sigma < self._along_below)
+            self._along = s.along_d and not asked and (self._along or (valid and sigma < self._along_below))
             waveform = Waveform.PULSATING if self._along else s.waveform
             return Command(waveform, self.amplitude, s.frequency, axis, s.time_to_live)
         if self._off_left > 0:

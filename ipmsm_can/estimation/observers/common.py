@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.filters import filter_coefficients
 from ipmsm_can.estimation.observers.kinds import INJECTION_EXTRACTION, NON_SALIENT, WINDOW_CAPACITY
-from ipmsm_can.estimation.observers.voltage_errors import BIASES, Uncertainty, corner, keeps
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, Uncertainty, keeps
 from ipmsm_can.motor import Motor
 
 _MOST_PERIODS = 16
@@ -122,7 +122,7 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "L_d": motor.L_d, "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor),
         "volts": u.voltage,
         "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
-        "corner": corner(motor), "rated": motor.rated_current, "tilt": u.tilt,
+        "corner": u.corner(motor), "rated": motor.rated_current, "tilt": u.tilt,
         "prior": u.priors(motor), "keep": keeps(sample_rate),
     }
     for name, value in values.items():

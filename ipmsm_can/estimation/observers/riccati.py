@@ -53,7 +53,7 @@ Floats = NDArray[np.float64]
 
 CORRELATION_TIME = 0.01
 """Time [s] over which a voltage error that is no state is taken as constant."""
-SHAPE = 0.25
+SHAPE = 0.4
 """What a phase near zero current loses, 1-sigma as a share of the dead time's voltage."""
 LONGEST = 0.2
 """Longest time [s] for which the shape of dead time is taken to keep its sign."""
@@ -278,7 +278,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         i2 = i_a * i_a + i_b * i_b
         residual2 = p.residual * p.residual + p.residual_R * p.residual_R * i2
         # Dead time as far as it is known: what it is taken for, and what it may be besides.
-        shape2 = SHAPE * SHAPE * (bias[2] * bias[2] + P[4, 4]) * near_zero(i_a, i_b, p.corner)
+        shape2 = SHAPE * SHAPE * (bias[2] * bias[2] + P[4, 4]) * near_zero(i_a, i_b, p.zone, p.corner)
         holds = min(max(_SIXTH / max(abs(st.pll_omega), 1e-9), CORRELATION_TIME), LONGEST)
         begins = st.started == 0
         if begins:

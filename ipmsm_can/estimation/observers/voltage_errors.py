@@ -37,9 +37,11 @@ _KEEPS = (10.0, 10.0, 10.0, 30.0)
 """Time constants [s]: temperature moves all of them."""
 TILT = 3.0
 """That angle [rad electrical] over the share by which L_d falls at rated current, as `drive.magnetics` has it."""
-CORNER_SHARE = 0.15
+CORNER_SHARE = 0.2
 """Phase current, as a share of the rated current, up to which the shape of dead time is uncertain: the output
-capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it."""
+capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it.  At most CORNER_NOISE
+times the current noise."""
+CORNER_NOISE = 20.0
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 
 
@@ -82,10 +84,12 @@ class Uncertainty:
         """Phase current [A] below which the sign of a phase's current is not relied on."""
         return max(4.0 * self.current, 0.02 * motor.rated_current)
 
+    def corner(self, motor: Motor) -> float:
+        """Phase current [A] up to which the shape of dead time is uncertain.
 
-def corner(motor: Motor) -> float:
-    """Phase current [A] up to which the shape of dead time is uncertain."""
-    return CORNER_SHARE * motor.rated_current
+        A sensor's noise goes with the size of its inverter, and so do the output capacitances.
+        """
+        return max(self.dead_zone(motor), min(CORNER_SHARE * motor.rated_current, CORNER_NOISE * self.current))
 
 
 def keeps(sample_rate: float) -> tuple[float, ...]:
@@ -111,14 +115,16 @@ def directions(i_a: float, i_b: float, zone: float, B: NDArray[np.float64]) -> N
 
 
 @kernel
-def near_zero(i_a: float, i_b: float, corner: float) -> float:
+def near_zero(i_a: float, i_b: float, zone: float, corner: float) -> float:
     """Square of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
 
-    A phase's share falls from 1 at zero current to 0 at `corner` [A]; the phases' errors are independent.
+    What a phase loses is odd in its current: at zero nobody doubts that it is nothing.  So its share rises up to
+    `zone`, the corner that B_2 assumes, and falls to 0 at the latest possible one, `corner` [A]; the phases' errors
+    are independent.
     """
     total = 0.0
     for phase in (i_a, -0.5 * i_a + _HALF_SQRT3 * i_b, -0.5 * i_a - _HALF_SQRT3 * i_b):
-        share = max(0.0, 1.0 - abs(phase) / corner)
+        share = min(abs(phase) / zone, 1.0) * max(0.0, 1.0 - abs(phase) / corner)
         total += share * share
     return 4.0 / 9.0 * total
 
