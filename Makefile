@@ -25,7 +25,7 @@ lint:
 	.venv/bin/mypy --strict
 
 test: lint
-	$(PYTHON) -m pytest -m "not vcan"
+	$(PYTHON) -m pytest -m "not vcan" -n 2 --dist loadfile
 	$(MAKE) firmware-test
 	@# Exit code 77 of tools/vcan/run: no CAN interface can be had here.
 	@code=0; \

@@ -35,9 +35,9 @@ That is the theory of `ges`; of the other observers it describes
                           Added here is whether the speed is plausible: |Phi| against that of a rotor that turns as
                           fast as the angle does.
                           While the rotor turns, what is wrong with voltage and motor data points everywhere in
-                          turn, and 2 sigma are rarely passed; at standstill all of it may stay at its worst and point the
-                          same way, 3 sigma and more.  So an angle has to be surer to become valid there than to
-                          stay so
+                          turn, and 2 sigma are rarely passed; at standstill all of it may stay at its worst and
+                          point the same way, 3 sigma and more.  So an angle has to be surer to become valid there
+                          than to stay so
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
                           is added.  They see an axis, not its north: polarity is not known unless `take_angle`
                           has told them; and none of their angles is valid, for a single window may be far off
