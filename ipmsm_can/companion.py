@@ -104,6 +104,15 @@ class Companion:
         flowing = [n for n in (node.frames_until_due(now_ns) for node in self.nodes.values()) if n]
         return min(flowing) if flowing else 1
 
+    def order_injection(self, node: int, wanted: bool | None) -> None:
+        """The operator's order: True inject, False do not, None leave it to the scheduler; within the limits of the
+        configuration, from the node's next command on.  May be called from another thread.
+
+        Without `transmit` it has no effect: nothing is ever sent then.
+        """
+        if self.transmit:
+            self.nodes[node].scheduler.operator(wanted)
+
     def process(self, block: FrameBlock, now_ns: int) -> FrameBlock:
         """Take in frames and give back what is to be sent now.
 

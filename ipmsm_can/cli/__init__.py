@@ -20,6 +20,7 @@ from ipmsm_can import __version__
 COMMANDS = {
     "demo": "a simulated drive and the companion on one bus, with a live status and a plot",
     "run": "the companion on a CAN bus",
+    "monitor": "everything of a drive on one screen, live or of a recording, with keys to record and to mark",
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",
@@ -31,8 +32,9 @@ COMMANDS = {
 }
 """Commands and what they do, in the order of the help."""
 
-_MODULES = {"bus": "health"}
-"""Modules that are not named as their command is: `cli.bus` is what all commands on a bus share."""
+_MODULES = {"bus": "health", "monitor": "live_view"}
+"""Modules that are not named as their command is: `cli.bus` is what all commands on a bus share, and `cli.monitor`
+takes the status of any."""
 
 _DESCRIPTION = """\
 Rotor position of interior permanent magnet motors from sampled currents and voltages on CAN.
