@@ -50,18 +50,29 @@ def chart(low: Sequence[float], high: Sequence[float], width: int, rows: int, le
     def level(value: float) -> int:
         return min(fine - 1, max(0, int((value - bottom) / (top - bottom) * fine)))
 
+    def mark(column: int, y: int) -> None:
+        up = fine - 1 - y
+        if ascii_only:
+            grid[up][column] = 1
+        else:
+            cell, side = divmod(column, 2)
+            grid[up // 4][cell] |= _DOTS[up % 4][side]
+
     grid = [[0] * (max(0, width - _LABEL - 1)) for _ in range(rows)]
     first = count - len(low)
-    for k, (a, b) in enumerate(zip(low, high, strict=True)):
+    before: tuple[int, int] | None = None
+    for k, (a, b) in enumerate(zip(low, high, strict=True), first):
         if not (math.isfinite(a) and math.isfinite(b)):
+            before = None
             continue
-        for y in range(level(a), level(b) + 1):
-            up = fine - 1 - y
-            if ascii_only:
-                grid[up][first + k] = 1
-            else:
-                cell, side = divmod(first + k, 2)
-                grid[up // 4][cell] |= _DOTS[up % 4][side]
+        bottom_y, top_y = level(a), level(b)
+        # no hole between a column and the one before it
+        begin, end = bottom_y, top_y
+        if before is not None:
+            begin, end = min(begin, before[1] + 1), max(end, before[0] - 1)
+        for y in range(begin, end + 1):
+            mark(k, y)
+        before = bottom_y, top_y
     bar, ink = ("|", "*") if ascii_only else ("│", "")
     lines = []
     for row, cells in enumerate(grid):

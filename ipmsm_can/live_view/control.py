@@ -65,7 +65,7 @@ class Controls:
         self.page = MAIN
         self.paused = False
         self.selected = 0
-        self.zoom = 1
+        self.zoom = 2
         self.marks = 0
         self.recording = recording
         self.orders: dict[int, bool] = {}

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rich.text import Text
 
@@ -19,27 +20,27 @@ _GOOD, _WARN, _BAD, _DIM = "cyan", "yellow", "bold reverse", "dim"
 _STYLES = {"error": _BAD, "warning": "bold yellow", "notice": "cyan"}
 _LABEL = 12
 _WIDE = 110
-_CHART_LEAST, _CHART_MOST = 3, 8
+_CHART_LEAST, _CHART_MOST = 3, 12
 _HELP = (
-    ("r", "start or stop recording every frame; the file's name is on the screen"),
+    ("r", "start or stop recording every frame (second line: the file)"),
     ("m", "mark this moment: in the record, and in the list of events"),
     ("i", "order the injection on (asks first); only with --transmit"),
     ("o", "order the injection off, at once"),
     ("a", "leave the injection to the companion again (automatic)"),
-    ("p, space", "hold the picture still; receiving, recording and answering go on"),
-    ("t", "time that the curves show: from 8 s to 1 min at 80 columns"),
-    ("f", "all findings with what to do about them, and all events"),
+    ("p, space", "hold the picture still; receiving and recording go on"),
+    ("t", "time that the curves show: 6, 12, 25 or 50 s at 80 columns"),
+    ("f", "all findings, with what to do about them, and all events"),
     ("tab", "the next drive, where there are several"),
     ("h, ?", "this page"),
     ("q, Ctrl-C", "end, with a summary"),
 )
 _NOTES = (
-    "angle: electrical, 0 to 360 deg, with its 1-sigma; NOT VALID means do not use it, whatever it says.",
-    "speed: mechanical, mean of the last 0.2 to 0.3 s; its sigma is what the angle's sigma allows over that time.",
-    "current, voltage: of one phase, rms over the same time; peak: longest current vector in it; i_d, i_q: peak.",
-    "curves: speed, 1-sigma of the angle, phase current (rms); a gap means no samples, or no angle.",
-    "excitation: smallest eigenvalue of the windowed integral of Phi Phi^T; near 0 no observer can see the rotor.",
-    "order to inject: it ends with a pause in the samples and must be given again.",
+    "angle: with its 1-sigma. NOT VALID: do not use it, whatever it says.",
+    "speed: mean of the last 0.3 s; its 1-sigma is what the angle's allows.",
+    "current, voltage: of one phase, rms of the last 0.3 s; peak: of its vector.",
+    "curves: a gap means no samples, or no angle.",
+    "excitation: of the observer's regression; near 0 the rotor cannot be seen.",
+    "An order to inject ends where the samples pause, and must be given again.",
 )
 
 
@@ -98,7 +99,7 @@ def _footer(status: MonitorStatus, width: int) -> list[Text]:
         keys = "no keys: standard input is not a terminal   Ctrl-C ends"
     else:
         parts = ["r stop rec" if status.recording else "r record", "m mark"]
-        parts += ["i inject", "o off", "a auto"] if status.injectable else []
+        parts += ["i o a injection"] if status.injectable else []
         parts += ["p go on" if status.paused else "p pause", "t time", "f findings"]
         parts += ["tab drive"] if len(status.drives) > 1 else []
         parts += ["h help", "q quit"]
@@ -112,21 +113,26 @@ def _footer(status: MonitorStatus, width: int) -> list[Text]:
 
 
 def _main(status: MonitorStatus, width: int, room: int) -> list[Text]:
-    lines: list[Text] = []
-    if len(status.drives) > 1:
-        lines += _table(status, width, max(2, room - 18))
-    drive = status.drives[status.selected] if status.drives else None
-    if drive is not None:
-        lines += _drive(drive, width, status.ascii)
+    drive = status.drives[status.selected]
+    numbers = _drive(drive, width, status.ascii)
     bus = _bus(status, width)
-    # Findings and events share a quarter, the curves get what is left.
-    left = room - len(lines) - len(bus)
-    told = _findings(status, width, 2 if left < 12 else 3 if left < 16 else left // 3)
-    events = _events(status, 1 if left < 12 else max(1, left // 5))
+    table = _table(status, width, room - len(numbers) - len(bus) - 2) if len(status.drives) > 1 else []
+    # Findings and events first, then the curves; what is still left parts the sections.
+    left = room - len(table) - len(numbers) - len(bus)
+    told = _findings(status, width, 2 if left < 12 else left // 3)
+    events = _events(status, 1 if left < 12 else left // 5)
     left -= len(told) + len(events)
-    if drive is not None and left > _CHART_LEAST:
-        lines += _charts(drive.course, width, min(_CHART_MOST, left - 1), status.ascii)
-    return lines + bus + told + events
+    curves = []
+    if left > _CHART_LEAST:
+        curves = _charts(drive.course, width, min(_CHART_MOST, left - 1), status.ascii)
+        left -= len(curves)
+    lines: list[Text] = []
+    for section in (table, numbers, curves, bus, told, events):
+        if lines and section and left > 0:
+            lines.append(Text())
+            left -= 1
+        lines += section
+    return lines
 
 
 def _labelled(label: str, *parts: str | tuple[str, str] | Text) -> Text:
@@ -161,11 +167,10 @@ def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
     if node.live and math.isfinite(drive.i_rms):
         axes = (f"i_d {drive.i_d:+.2f}  i_q {drive.i_q:+.2f} A peak" if math.isfinite(drive.i_d) and node.known
                 else "i_d, i_q unknown")
-        of = f" {100.0 * drive.i_rms / drive.rated:.0f} % of rated" if drive.rated > 0.0 else ""
+        of = f"{100.0 * drive.i_rms / drive.rated:.0f} % of rated current" if drive.rated > 0.0 else ""
         current = f"{drive.i_rms:.2f} A rms, {drive.i_peak:.2f} A peak"
         lines.append(_labelled("current", f"{current:34}{axes}"))
-        lines.append(_labelled("voltage", f"{f'{drive.v_rms:.1f} V rms per phase':34}current is{of}" if of else
-                               f"{drive.v_rms:.1f} V rms per phase"))
+        lines.append(_labelled("voltage", f"{f'{drive.v_rms:.1f} V rms to neutral':34}{of}"))
     else:
         lines.append(_labelled("current", "unknown"))
     lines.append(_probing(drive))
@@ -202,8 +207,9 @@ def _counts(pairs: Sequence[tuple[str, int]]) -> Text:
 def _table(status: MonitorStatus, width: int, room: int) -> list[Text]:
     """One line for each drive, the selected one marked; as many around it as there is room for."""
     lines = [Text(f"  {'':15}{'angle el. deg':16}{'rpm mech.':>10}{'A rms':>8}{'lost':>7}  injection", style=_DIM)]
-    begin = max(0, min(status.selected - (room - 2) // 2, len(status.drives) - (room - 1)))
-    for k, drive in enumerate(status.drives[begin:begin + room - 1], begin):
+    fits = max(1, room - 1)
+    begin = max(0, min(status.selected - fits // 2, len(status.drives) - fits))
+    for k, drive in enumerate(status.drives[begin:begin + fits], begin):
         n = drive.node
         state = "VALID" if n.valid else "not valid" if n.live else "silent"
         angle = f"{math.degrees(n.theta) % 360.0:5.1f} +/- {math.degrees(n.sigma):.1f}" if n.known else "unknown"
@@ -212,15 +218,15 @@ def _table(status: MonitorStatus, width: int, room: int) -> list[Text]:
         mark, style = (">", "bold") if k == status.selected else (" ", "")
         lines.append(Text(f"{mark} {n.node:<4}{state:11}{angle:16}{rpm:>10}{amps:>8}{n.lost:>7}  {n.injection}",
                           style=style))
-    return [*lines, Text()]
+    return lines
 
 
 def _charts(course: Course, width: int, rows: int, ascii_only: bool) -> list[Text]:
     """Title and curves, side by side: speed, sigma, and where there is room the current."""
-    curves = [("speed, rpm mechanical", course.speed_low, course.speed_high, 10.0, False),
-              ("sigma of the angle, deg", course.sigma, course.sigma, 1.0, True)]
+    curves = [("speed [rpm mech.]", course.speed_low, course.speed_high, 10.0, False),
+              ("1 sigma of the angle [deg el.]", course.sigma, course.sigma, 1.0, True)]
     if width >= _WIDE:
-        curves.append(("phase current, A rms", course.current, course.current, 0.1, True))
+        curves.append(("phase current [A rms]", course.current, course.current, 0.1, True))
     each = width // len(curves) - 1
     seconds = chart.points(each, ascii_only) * course.column_s
     titles, blocks = [], []
@@ -241,13 +247,13 @@ def _bus(status: MonitorStatus, width: int) -> list[Text]:
     load = _labelled("bus load", f"{100 * bus.load:5.1f} % ", full * filled + empty * (20 - filled),
                      f"  {bus.frames_per_s:.0f} frames/s")
     if bus.load > 1.0:
-        load.append("  more than the bit rate carries", style="bold yellow")
+        load.append("  impossible: bit rate?", style="bold yellow")
     troubles = [("kernel drops", bus.drops), ("error frames", bus.error_frames), ("unknown ids", bus.unknown)]
     troubles += [(name, n) for name, n in (("wrong length", bus.wrong_length), ("remote", bus.remote),
                                            ("outages", bus.outages)) if n]
     lines = [load, _labelled("bus", f"{bus.frames} frames  ", _counts(troubles))]
     if status.run.transmit:
-        lines.append(_labelled("answers", f"{bus.sent} sent  turnaround {plain.turnaround(bus)}  ",
+        lines.append(_labelled("answers", f"{bus.sent} sent  after {plain.turnaround(bus)}  ",
                                _counts([("unsent", bus.unsent), ("too late", bus.late)])))
     return lines
 
@@ -289,16 +295,14 @@ def _events(status: MonitorStatus, room: int) -> list[Text]:
 def _all_findings(status: MonitorStatus, width: int, room: int) -> list[Text]:
     lines = [Text("findings" if status.findings else f"no findings; looked for: {status.checked}", style="bold")]
     for told in status.findings:
-        lines += _finding(told, width, True)
-        if told.since:
-            lines[-1].append(f"  (since {told.since})", style=_DIM)
+        lines += _finding(replace(told, advice=f"{told.advice} (since {told.since})"), width, True)
     lines += [Text(), Text("events" if status.events else "no events", style="bold")]
     left = room - len(lines)
     return lines + _events(status, max(left, 3))
 
 
 def _help(width: int) -> list[Text]:
-    lines = [Text.assemble((f"  {key:{_LABEL}}", "bold"), words) for key, words in _HELP]
+    lines = [Text.assemble((f"{key:{_LABEL}}", "bold"), words) for key, words in _HELP]
     lines.append(Text())
     for note in _NOTES:
         parts = textwrap.wrap(note, max(20, width - 2), subsequent_indent="  ")
