@@ -20,6 +20,7 @@ from ipmsm_can import __version__
 COMMANDS = {
     "demo": "a simulated drive and the companion on one bus, with a live status and a plot",
     "run": "the companion on a CAN bus",
+    "record": "every frame of a CAN bus into a log, and a measurement file with the estimates",
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ipmsm_can.bus.health import BusHealth
     from ipmsm_can.bus.health_report import HealthReport
     from ipmsm_can.cli.status import HealthStatus
+    from ipmsm_can.record.status import RecordStatus
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -72,7 +73,7 @@ def _recorded(args: argparse.Namespace) -> int:
     reader = read_log(path, block_frames=_BLOCK_FRAMES, channel=getattr(args, "channel", None))
     # candump writes what SocketCAN said; other formats also hold error frames of other origin
     kind = [s.lower() for s in path.suffixes if s.lower() != ".gz"][-1:]
-    health = _health(args, error_classes=kind == [".log"])
+    health = build_health(args, error_classes=kind == [".log"])
     for block in reader:
         health.update(block)
     code = _tell(health.report(str(path)), args.json)
@@ -91,11 +92,11 @@ def _live(args: argparse.Namespace) -> int:
     from ipmsm_can.cli.screen import Screen
 
     socketcan = bus_configuration(args)[0]["interface"] == "socketcan"
-    health = _health(args, error_classes=socketcan)
+    health = build_health(args, error_classes=socketcan)
     with (bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port,
           Link(port, lambda: bus.open_bus(args)) as link):
         listener = Listener(link, health, isinstance(port, SocketCanPort), not args.no_reconnect)
-        status = _status(listener.report)
+        status = health_status("ipmsm-can bus", listener.report)
         gone = ""
         with nullcontext() if args.quiet or args.json else Screen(status):
             try:
@@ -108,16 +109,19 @@ def _live(args: argparse.Namespace) -> int:
     return 1 if gone else code
 
 
-def _status(report: Callable[[], HealthReport]) -> Callable[[], HealthStatus]:
+def health_status(title: str, report: Callable[[], HealthReport],
+                  records: Callable[[], tuple[RecordStatus, ...]] = tuple) -> Callable[[], HealthStatus]:
+    """What takes the status of a listener, and of what it records."""
     import time
 
     from ipmsm_can.cli.status import HealthStatus
 
     begin = time.monotonic()
-    return lambda: HealthStatus("ipmsm-can bus", time.monotonic() - begin, report())
+    return lambda: HealthStatus(title, time.monotonic() - begin, report(), records())
 
 
-def _health(args: argparse.Namespace, error_classes: bool) -> BusHealth:
+def build_health(args: argparse.Namespace, error_classes: bool) -> BusHealth:
+    """A `BusHealth` with the bit rates and databases of the options, its kernels compiled."""
     from ipmsm_can.bus.health import BusHealth, warm_up
     from ipmsm_can.wire.protocol import Protocol
 
