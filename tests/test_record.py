@@ -57,10 +57,11 @@ def mixed() -> FrameBlock:
 
 def numbers(path: Path) -> list[int]:
     block = FrameBlock.concat(read_log(path))
-    return block.words[block.can_id == 0x123, 1].tolist()
+    found: list[int] = block.words[block.can_id == 0x123, 1].tolist()
+    return found
 
 
-@pytest.mark.parametrize("suffix", [".blf", ".log", ".log.gz"])
+@pytest.mark.parametrize("suffix", [".blf", ".log", ".log.gz", ".mf4"])
 def test_every_kind_of_frame_comes_back_and_marks_stand_between(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"run{suffix}"
     block = mixed()

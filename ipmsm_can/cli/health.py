@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ipmsm_can.bus.health import BusHealth
     from ipmsm_can.bus.health_report import HealthReport
     from ipmsm_can.cli.status import HealthStatus
+    from ipmsm_can.logs import Mark
     from ipmsm_can.record.status import RecordStatus
     from ipmsm_can.wire.protocol import Protocol
 
@@ -38,6 +39,7 @@ exit codes: 0 nothing grave, 1 a finding of severity "error", 2 bad input
 """
 _BITRATE, _DATA_BITRATE = 1_000_000, 5_000_000
 _BLOCK_FRAMES = 65536
+_MARKS_SHOWN = 50
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,7 +69,7 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _recorded(args: argparse.Namespace) -> int:
-    from ipmsm_can.logs import read_log
+    from ipmsm_can.logs import gaps, read_log
 
     path = Path(args.log)
     reader = read_log(path, block_frames=_BLOCK_FRAMES, channel=getattr(args, "channel", None))
@@ -76,12 +78,26 @@ def _recorded(args: argparse.Namespace) -> int:
     health = build_health(args, error_classes=kind == [".log"])
     for block in reader:
         health.update(block)
+    found = gaps(reader.marks)
+    health.note_outages(len(found), sum(gap.seconds for gap in found), "")
     code = _tell(health.report(str(path)), args.json)
+    if reader.marks and not args.json:
+        print(_marked(reader.marks))
     if reader.problem or reader.bad_lines:
         told = reader.problem or f"{path} is damaged: {reader.bad_lines} of its lines cannot be read"
         print(f"ipmsm-can bus: {told}; what was readable is in the report", file=sys.stderr)
         return 2
     return code
+
+
+def _marked(marks: Sequence[Mark]) -> str:
+    """The remarks of a recording, by this computer's clock."""
+    import time
+
+    lines = [f"  {time.strftime('%H:%M:%S', time.localtime(1e-9 * mark.t_ns))}.{mark.t_ns // 10**6 % 1000:03d}  "
+             f"{mark.text}" for mark in marks[:_MARKS_SHOWN]]
+    more = len(marks) - len(lines)
+    return "\n".join(["marked in the recording:", *lines, *([f"  ... and {more} more"] if more else [])])
 
 
 def _live(args: argparse.Namespace) -> int:

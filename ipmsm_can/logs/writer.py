@@ -1,4 +1,4 @@
-"""Blocks of frames as logs: candump text and BLF by compiled writers, every other format by python-can."""
+"""Blocks of frames as logs: candump text and BLF by compiled writers, MF4 in arrays, the others by python-can."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Protocol, Self, cast
+from typing import IO, TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from ipmsm_can.logs import blf_kernel, candump
 from ipmsm_can.logs.blf import BlfWriter
 from ipmsm_can.logs.marks import SIGNS, Mark, as_comment, beside
 from ipmsm_can.logs.source import LogError, words_of
+
+if TYPE_CHECKING:
+    from ipmsm_can.logs.mf4_writer import Mf4Writer
 
 _PATIENCE_S = 60.0
 KINDS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")
@@ -109,6 +112,17 @@ def warm_up() -> None:
     blf_kernel.lay_out(block.raw, block.t_ns, 0, 1, np.zeros(blf_kernel.OBJECT_BYTES, np.uint8))
 
 
+def _mf4_writer() -> type[Mf4Writer]:
+    try:
+        import asammdf  # noqa: F401
+    except ImportError:
+        raise LogError("MF4 needs the package asammdf, which is not installed; install it "
+                       "(pip install 'ipmsm_can[mf4]')") from None
+    from ipmsm_can.logs.mf4_writer import Mf4Writer
+
+    return Mf4Writer
+
+
 class LogWriter:
     """Record blocks in a log; the suffix chooses the format, as in `read_log`.
 
@@ -124,9 +138,10 @@ class LogWriter:
         try:
             if suffixes[-1:] == [".log"] or suffixes[-2:] == [".log", ".gz"]:
                 self._writer = _CandumpWriter(self.path, suffixes[-1] == ".gz", channel)
-            elif suffixes[-1:] == [".blf"]:
+            elif suffixes[-1:] in ([".blf"], [".mf4"]):
                 number = re.search(r"\d+$", channel)
-                self._writer = BlfWriter(self.path, int(number[0]) if number else 0)
+                kind = BlfWriter if suffixes[-1] == ".blf" else _mf4_writer()
+                self._writer = kind(self.path, int(number[0]) if number else 0)
             else:
                 self._writer = _PythonCanWriter(self.path, channel)
         except Exception as error:  # every format's writer raises what it likes

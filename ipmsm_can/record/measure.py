@@ -4,9 +4,9 @@ One channel group per drive and rate: the samples together with the estimates at
 sample counter; and one for each of the other messages, on the time of arrival, with the names, units, scalings and
 value tables of the DBC.  Time 0 is the first frame.
 
-Rows gather in memory up to BATCH and go to a temporary file beside the measurement; MDF is put together from it at the
-end.  So memory stays flat, but a program that is killed leaves no measurement: the raw log is what survives, and
-`ipmsm-can replay LOG --drive drive.toml --out run.mf4` makes it anew from that.
+Rows gather in memory up to BATCH and go to a temporary file beside the measurement, from which that is put together
+at the end.  So memory stays flat, but a program that is killed leaves no measurement: the raw log is what survives,
+and `ipmsm-can replay LOG --drive drive.toml --out run.mf4` makes it anew from that.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ class MeasureFile:
         if group.index < 0:
             group.index = self._file.append(
                 [Signal(samples=columns[name], timestamps=time_s, name=name, unit=unit, comment=comment,
-                        conversion=conversion, raw=True)
+                        conversion=conversion)
                  for name, (unit, comment, conversion) in group.channels.items()],
                 acq_name=group.name, comment=group.name, common_timebase=True)
             return
