@@ -161,11 +161,14 @@ class NodeSummary:
 class Replay:
     """Feeds blocks of a log to a companion and hands rows to `sink`.
 
-    configs: the drives; `prepare` should have looked at them.  sink: may be None.
+    configs: the drives; `prepare` should have looked at them.  sink: may be None.  tap: is shown each block with
+    what was estimated from it.
     summaries, companion: results by node number.  standard_ids (2048,), extended_ids: frames by identifier.
     """
 
-    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, sink: Sink | None = None) -> None:
+    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, sink: Sink | None = None,
+                 tap: Callable[[FrameBlock, Sequence[Tracked]], None] | None = None) -> None:
+        self._tap = tap
         self.companion = Companion(configs, protocol, transmit=False)
         self.summaries = {c.wire.node: NodeSummary() for c in configs}
         self.standard_ids = np.zeros(CAN_SFF_MASK + 1, np.int64)
@@ -180,8 +183,11 @@ class Replay:
             return
         self._note_ids(block)
         self._references(block)
-        for part in self.companion.feed(block):
+        tracked = self.companion.feed(block)
+        for part in tracked:
             self._rows(part)
+        if self._tap is not None:
+            self._tap(block, tracked)
 
     def _note_ids(self, block: FrameBlock) -> None:
         ids = block.can_id

@@ -21,6 +21,7 @@ COMMANDS = {
     "demo": "a simulated drive and the companion on one bus, with a live status and a plot",
     "run": "the companion on a CAN bus",
     "monitor": "everything of a drive on one screen, live or of a recording, with keys to record and to mark",
+    "record": "every frame of a CAN bus into a log, and a measurement file with the estimates",
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",

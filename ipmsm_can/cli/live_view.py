@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ipmsm_can.cli import bus
+from ipmsm_can.cli import bus, recording
 
 if TYPE_CHECKING:
     from ipmsm_can.bus.health import BusHealth
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from ipmsm_can.config import DriveConfig
     from ipmsm_can.drive.profile import Profile
     from ipmsm_can.frames import FrameBlock
-    from ipmsm_can.live_view.control import Recording
+    from ipmsm_can.live_view.recording import KeyRecording
     from ipmsm_can.live_view.status import MonitorStatus
     from ipmsm_can.live_view.taking import LiveView
     from ipmsm_can.live_view.watch import Source
+    from ipmsm_can.record.tap import Tap
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -57,7 +58,7 @@ _DEMO_ROUNDS = 250
 _DEMO_THETA = math.radians(70.0)
 _BLOCK_FRAMES = 2048
 _TURN_S = 0.001
-_TOLD_AT_THE_END = ("mark ", "recording ", "recorded ", "cannot record", "drive ")
+_TOLD_AT_THE_END = ("mark ", "recording ", "cannot record", "drive ")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--demo", action="store_true", help="a simulated drive inside the program, no bus; with "
                         "--fd it samples at 10 kHz")
     parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
+    recording.add_arguments(parser)
     parser.add_argument("--ascii", action="store_true", help="draw with plain characters")
     parser.add_argument("--no-reconnect", action="store_true", help="end when the bus goes away")
     bus.add_arguments(parser)
@@ -103,6 +105,7 @@ def main(args: argparse.Namespace) -> int:
     configs = load_configs(args.configs) if args.configs else (
         config_from({"motor": {"preset": "m2"}}, source="demo"),)
     rates = bus.bit_rates(args, configs)
+    recording.check(args)
     if not (args.log or args.demo):
         bus.check_named(args)
     protocol = build_protocol(configs)
@@ -111,16 +114,19 @@ def main(args: argparse.Namespace) -> int:
         warm_up()
         sources = _sources(args, configs, protocol, rates)
     configs, open_port, source = _opener(args, configs, protocol)
-    with (_stop(args.duration) as stop, _short_turns(), open_port() as port, Link(port, open_port) as link):
+    with (_stop(args.duration) as stop, _short_turns(), open_port() as port, Link(port, open_port) as link,
+          _recording(args, link, configs, protocol) as (record, tap)):
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
                             None if args.no_reconnect else link)
         clock, news = FrameClock(of_day=args.log is None), threading.Event()
-        controls = Controls(runner.companion, _recording(args, link), lambda: stop.now("q"), clock.now_ns,
-                            clock.words, news)
+        controls = Controls(runner.companion, record, lambda: stop.now("q"), clock.now_ns, clock.words, news)
+        if args.record:
+            controls.toggle_record()
         watch = Watch(sources, lambda: clock.words(clock.now_ns()), controls.note_finding)
-        view = LiveView(runner, controls, watch, clock, source)
+        view = LiveView(runner, controls, watch, clock, source, tap.status)
         view.ascii = args.ascii or not _is_utf8()
         code, last = _serve(runner, view, news, lambda: stop() or getattr(link.port, "finished", False))
+    code = max(code, recording.code_of(tap), int(record is not None and not record.whole))
     if link.down:
         print(f"ipmsm-can monitor: there is {link.words}", file=sys.stderr)
         code = 1
@@ -141,6 +147,8 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError("--transmit is given with --log; a recording cannot be answered")
     if args.speed is not None and args.log is None:
         raise ValueError("--speed is given without --log; only a recording can be played at another speed")
+    if args.log is not None and args.record:
+        raise ValueError("--record is given with --log, which is a recording already")
     if not args.configs and not args.demo:
         raise ValueError("no drive.toml is given; allowed is one for each drive (`ipmsm-can config --explain` "
                          "writes one), or --demo")
@@ -210,9 +218,28 @@ class BusSource:
         return self._health.report().findings
 
 
-def _recording(args: argparse.Namespace, link: Link) -> Recording | None:
-    """What the keys record with; a recording that is played needs none."""
-    return None
+@contextmanager
+def _recording(args: argparse.Namespace, link: Link, configs: tuple[DriveConfig, ...],
+               protocol: Protocol) -> Iterator[tuple[KeyRecording | None, Tap]]:
+    """What the keys record with, None where a recording is played; and what feeds it and --measure."""
+    from ipmsm_can.live_view.recording import KeyRecording
+    from ipmsm_can.logs.writer import warm_up
+
+    path = None if args.record is None else Path(args.record)
+    own = argparse.Namespace(**{**vars(args), "record": None})
+    with recording.recordings(own, link, configs, protocol) as tap:
+        if args.log is not None:
+            yield None, tap
+            return
+        with bus.patience():
+            warm_up()
+        record = KeyRecording(tap, str(getattr(args, "channel", None) or "can0"), path, recording.rotation(args))
+        try:
+            yield record, tap
+        finally:
+            record.stop()
+            with contextlib.suppress(OSError):  # a terminal that hung up
+                print("".join(f"{words}\n" for words in record.summaries), end="")
 
 
 def _serve(runner: LiveRunner, view: LiveView, news: threading.Event,

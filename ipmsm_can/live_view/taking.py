@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from ipmsm_can.bus.live import LiveRunner
@@ -15,10 +15,12 @@ from ipmsm_can.live_view.course import CourseRing
 from ipmsm_can.live_view.status import DriveView, MonitorStatus
 from ipmsm_can.live_view.watch import Watch
 from ipmsm_can.node import Tracked
+from ipmsm_can.record.status import RecordStatus
 
 COLUMNS = 240
 """Columns of the curves that are worked out: enough for a very wide terminal."""
 _DAY = 86400 * 10**9
+_LONGEST_ROUND_S = 0.5
 
 
 class FrameClock:
@@ -27,8 +29,10 @@ class FrameClock:
     of_day: live frames carry Unix time; else (a log) time is told from the first frame.
     """
 
-    def __init__(self, of_day: bool) -> None:
-        self.newest = 0
+    def __init__(self, of_day: bool, clock: Callable[[], float] = time.monotonic) -> None:
+        self._newest = 0
+        self._at = 0.0
+        self._clock = clock
         self._first: int | None = None
         self._of_day = of_day
 
@@ -36,11 +40,12 @@ class FrameClock:
         """The runner's time after a round."""
         if self._first is None and now_ns > _DAY:
             self._first = now_ns
-        self.newest = now_ns
+        self._newest, self._at = now_ns, self._clock()
 
     def now_ns(self) -> int:
-        """As of now [ns]."""
-        return self.newest
+        """As of now [ns]: rounds may be a quarter of a second apart."""
+        passed = min(self._clock() - self._at, _LONGEST_ROUND_S) if self._newest else 0.0
+        return self._newest + round(1e9 * passed)
 
     def words(self, t_ns: int) -> str:
         """14:03:12, or 0:12.345 from the first frame of a log."""
@@ -54,12 +59,12 @@ class FrameClock:
 class LiveView:
     """Hands out `MonitorStatus`: `observe` is the runner's observer, `status` may be called from another thread.
 
-    source: where the frames come from, in words; None: what the port says.
+    source: where the frames come from, in words; None: what the port says.  records: what is recorded.
     """
 
     def __init__(self, runner: LiveRunner, controls: Controls, watch: Watch, clock: FrameClock,
-                 source: str | None = None) -> None:
-        self.monitor = RunMonitor(runner, "ipmsm-can monitor")
+                 source: str | None = None, records: Callable[[], tuple[RecordStatus, ...]] = tuple) -> None:
+        self.monitor = RunMonitor(runner, "ipmsm-can monitor", records)
         self.controls = controls
         self.watch = watch
         self.keys = True
