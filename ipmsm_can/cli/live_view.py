@@ -165,7 +165,7 @@ def _opener(args: argparse.Namespace, configs: tuple[DriveConfig, ...], protocol
         reader = read_log(Path(args.log), block_frames=_BLOCK_FRAMES, channel=getattr(args, "channel", None))
         chosen, blocks = prepare(configs, protocol, reader)
         speed = args.speed or 1.0
-        words = f"{args.log}, played" + (f" {speed:g} times as fast" if speed != 1.0 else "")
+        words = f"{Path(args.log).name}, played" + (f" {speed:g} times as fast" if speed != 1.0 else "")
         played = LogPort(blocks, speed, words)
         args.reader = reader
         return tuple(chosen), lambda: played, words
@@ -325,8 +325,10 @@ def _is_utf8() -> bool:
 
 
 def _locale_is_utf8() -> bool:
-    # Python turns LANG=C into UTF-8 for itself, so its own encoding does not tell.
     if sys.platform == "win32":
         return True
-    said = next((value for name in ("LC_ALL", "LC_CTYPE", "LANG") if (value := os.environ.get(name))), "C")
+    # Where LANG is C, Python takes UTF-8 for itself, and sets LC_CTYPE so: neither tells of the terminal.
+    ours = os.environ.get("LC_CTYPE") == "C.UTF-8"
+    names = ("LC_ALL", "LANG") if ours else ("LC_ALL", "LC_CTYPE", "LANG")
+    said = next((value for name in names if (value := os.environ.get(name))), "C")
     return "utf8" in said.lower().replace("-", "")

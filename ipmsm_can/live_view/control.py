@@ -42,6 +42,10 @@ class Recording(Protocol):
         """A file is being written."""
 
     @property
+    def path(self) -> str:
+        """The file that is, or was last, written."""
+
+    @property
     def words(self) -> str:
         """Where it is, or was last, written, and how much, for people."""
 
@@ -140,7 +144,7 @@ class Controls:
                 self.tell(f"cannot record: {error}")
                 self.note(f"cannot record: {error}", "error")
                 return
-            self.note(f"recording to {recording.words}")
+            self.note(f"recording to {recording.path}")
 
     def stop_record(self) -> None:
         """Finish the record, where one runs."""

@@ -76,7 +76,7 @@ class CourseRing:
         known = max(begin, end) < KNOWN
         aligned = int(bins["aligned"].sum())
         return Present(
-            omega=float(bins["omega"].sum()) / n,
+            omega=float(bins["omega"].sum()) / aligned if aligned else math.nan,
             omega_sigma=math.hypot(begin, end) / span if known else math.nan,
             i_rms=math.sqrt(float(bins["i2"].sum()) / n / 2.0), i_peak=math.sqrt(float(bins["i2_max"].max())),
             i_d=float(bins["i_d"].sum()) / aligned if aligned else math.nan,

@@ -21,8 +21,8 @@ BIN = np.dtype([
     ("key", "i8"), ("n", "i8"), ("i2", "f8"), ("i2_max", "f8"), ("v2", "f8"), ("aligned", "i8"), ("i_d", "f8"),
     ("i_q", "f8"), ("omega", "f8"), ("omega_low", "f8"), ("omega_high", "f8"), ("sigma", "f8"), ("sigma_max", "f8"),
 ])
-"""key: bin number since the epoch.  Sums over n samples: i2 = |i|^2, v2 = |v|^2 (vectors, peak), omega; i_d and i_q
-over the `aligned` ones that have an angle.  sigma: of the last sample."""
+"""key: bin number since the epoch.  Sums over n samples: i2 = |i|^2, v2 = |v|^2 (vectors, peak); over the `aligned`
+ones that have an angle: i_d, i_q, omega, and its range.  sigma: of the last sample."""
 
 
 @kernel
@@ -59,14 +59,14 @@ def add_block(values: Floats, t_ns: Ints, theta: Floats, omega: Floats, sigma: F
         b.i2 += i2
         b.i2_max = max(b.i2_max, i2)
         b.v2 += values[2, k] * values[2, k] + values[3, k] * values[3, k]
-        b.omega += omega[k]
-        b.omega_low = min(b.omega_low, omega[k])
-        b.omega_high = max(b.omega_high, omega[k])
         b.sigma = sigma[k]
         b.sigma_max = max(b.sigma_max, sigma[k])
         if sigma[k] < known and theta[k] == theta[k]:
             c = math.cos(theta[k])
             s = math.sin(theta[k])
             b.aligned += 1
+            b.omega += omega[k]
+            b.omega_low = min(b.omega_low, omega[k])
+            b.omega_high = max(b.omega_high, omega[k])
             b.i_d += c * values[0, k] + s * values[1, k]
             b.i_q += c * values[1, k] - s * values[0, k]

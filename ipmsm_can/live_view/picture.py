@@ -19,7 +19,7 @@ from ipmsm_can.live_view.status import FINDINGS, HELP, Course, DriveView, Monito
 _GOOD, _WARN, _BAD, _DIM = "cyan", "yellow", "bold reverse", "dim"
 _STYLES = {"error": _BAD, "warning": "bold yellow", "notice": "cyan"}
 _LABEL = 12
-_WIDE = 110
+_NARROW, _WIDE = 72, 110
 _CHART_LEAST, _CHART_MOST = 3, 12
 _HELP = (
     ("r", "start or stop recording every frame (second line: the file)"),
@@ -139,8 +139,9 @@ def _labelled(label: str, *parts: str | tuple[str, str] | Text) -> Text:
     return Text.assemble((f"{label:{_LABEL}}", _DIM), *parts)
 
 
-def _signed(value: float, unit: str, form: str = "+.1f") -> str:
-    return f"{value:{form}} {unit}" if math.isfinite(value) else f"unknown {unit}"
+def _fine(sigma: float) -> str:
+    """A 1-sigma with as many digits as say something: never 0.0 for what is not."""
+    return f"{sigma:.1f}" if sigma >= 0.95 else f"{sigma:.2f}" if sigma >= 0.01 else "<0.01"
 
 
 def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
@@ -154,16 +155,19 @@ def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
     head.append(flags)
     trust = (node.trust, "bold cyan" if node.valid else "bold yellow" if node.live else _BAD)
     if node.known:
-        angle = f"{math.degrees(node.theta) % 360.0:5.1f}{deg} {pm} {math.degrees(node.sigma):.1f}{deg} electrical"
+        sigma = _fine(math.degrees(node.sigma))
+        angle = f"{math.degrees(node.theta) % 360.0:5.1f}{deg} {pm} {sigma}{deg} electrical"
     else:
         angle = "unknown"
     if node.live and math.isfinite(drive.rpm):
-        sure = f" {pm} {drive.rpm_sigma:.1f}" if math.isfinite(drive.rpm_sigma) and node.known else ""
+        sure = f" {pm} {_fine(drive.rpm_sigma)}" if math.isfinite(drive.rpm_sigma) and node.known else ""
         speed = f"{drive.rpm:+7.1f}{sure} rpm mechanical"
         speed = f"{speed:34}{node.omega:+.1f} rad/s electrical"
     else:
         speed = "unknown"
-    lines = [head, _labelled("angle", f"{angle:34}", trust), _labelled("speed", speed)]
+    # Whether it may be used must not be cut off.
+    shown = (trust, f"  {angle}") if width < _NARROW else (f"{angle:34}", trust)
+    lines = [head, _labelled("angle", *shown), _labelled("speed", speed)]
     if node.live and math.isfinite(drive.i_rms):
         axes = (f"i_d {drive.i_d:+.2f}  i_q {drive.i_q:+.2f} A peak" if math.isfinite(drive.i_d) and node.known
                 else "i_d, i_q unknown")

@@ -94,6 +94,12 @@ class KeyRecording:
         return self._last if recorder is None else recorder.status()
 
     @property
+    def path(self) -> str:
+        """The file that is, or was last, written."""
+        status = self._status()
+        return "" if status is None else status.path
+
+    @property
     def words(self) -> str:
         """"run.blf 1.2 MB"."""
         status = self._status()
