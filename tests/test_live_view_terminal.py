@@ -50,9 +50,9 @@ def test_a_session_with_every_key(tmp_path: Path) -> None:
         t.press("p")
         t.wait(" PAUSED ")
         t.look(0.3)
-        speeds = [line for line in t.lines if line.startswith(("speed", "samples", "bus  "))]
+        speeds = [line for line in t.lines if line.startswith(("speed", "samples", "bus load"))]
         t.look(0.6)
-        assert [line for line in t.lines if line.startswith(("speed", "samples", "bus  "))] == speeds
+        assert [line for line in t.lines if line.startswith(("speed", "samples", "bus load"))] == speeds
         assert len(speeds) == 3
         t.press("p\x1b[A\x1bOP")  # arrows and function keys mean nothing
         t.press("h")

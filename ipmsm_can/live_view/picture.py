@@ -181,7 +181,7 @@ def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
     lines.append(_labelled("samples", f"{node.samples_per_s:.0f}/s of {node.sample_rate:.0f} Hz   "
                            f"excitation {node.excitation:.3g} V^2 s"))
     always = {"lost", "gaps", "bad frames"}
-    lines.append(_labelled("losses", _counts([(name, n) for name, n in plain.losses(node) if n or name in always])))
+    lines += _listed("losses", [(name, n) for name, n in plain.losses(node) if n or name in always], width)
     if node.encoder:
         lines.append(_labelled("encoder", (node.encoder, _WARN)))
     if node.timing:
@@ -206,6 +206,17 @@ def _counts(pairs: Sequence[tuple[str, int]]) -> Text:
     for k, (name, n) in enumerate(pairs):
         text.append(f"{'  ' if k else ''}{name} {n}", style="bold yellow" if n else "")
     return text
+
+
+def _listed(label: str, pairs: Sequence[tuple[str, int]], width: int) -> list[Text]:
+    """Counts on as many lines as they need."""
+    lines: list[Text] = []
+    rest = list(pairs)
+    while rest:
+        fits = next((n for n in range(len(rest), 1, -1) if _LABEL + _counts(rest[:n]).cell_len <= width), 1)
+        lines.append(_labelled("" if lines else label, _counts(rest[:fits])))
+        rest = rest[fits:]
+    return lines
 
 
 def _table(status: MonitorStatus, width: int, room: int) -> list[Text]:
@@ -249,13 +260,13 @@ def _bus(status: MonitorStatus, width: int) -> list[Text]:
     full, empty = ("#", ".") if status.ascii else ("█", "░")
     filled = round(20 * min(1.0, max(0.0, bus.load)))
     load = _labelled("bus load", f"{100 * bus.load:5.1f} % ", full * filled + empty * (20 - filled),
-                     f"  {bus.frames_per_s:.0f} frames/s")
+                     f"  {bus.frames_per_s:.0f} frames/s, {bus.frames} so far")
     if bus.load > 1.0:
-        load.append("  impossible: bit rate?", style="bold yellow")
+        load.append("  wrong bit rate?", style="bold yellow")
     troubles = [("kernel drops", bus.drops), ("error frames", bus.error_frames), ("unknown ids", bus.unknown)]
     troubles += [(name, n) for name, n in (("wrong length", bus.wrong_length), ("remote", bus.remote),
                                            ("outages", bus.outages)) if n]
-    lines = [load, _labelled("bus", f"{bus.frames} frames  ", _counts(troubles))]
+    lines = [load, *_listed("bus", troubles, width)]
     if status.run.transmit:
         lines.append(_labelled("answers", f"{bus.sent} sent  after {plain.turnaround(bus)}  ",
                                _counts([("unsent", bus.unsent), ("too late", bus.late)])))

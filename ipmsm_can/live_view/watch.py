@@ -118,7 +118,7 @@ class Watch:
         found.sort(key=lambda told: SEVERITIES.index(told.severity))
         marked = []
         for told in found:
-            key = told.severity + _NUMBER.sub("#", told.sentence)
+            key = told.severity + _NUMBER.sub("#", told.sentence)  # a number that changes is no news
             new = key not in self._since
             since = self._since.setdefault(key, self._stamp())
             told = Told(told.severity, told.sentence, told.advice, since)
