@@ -618,8 +618,9 @@ def test_an_hour_at_10_khz_leaves_nothing_behind() -> None:
 
     growth = run(hours=1.0, warm_up_hours=0.1, thorough=False)
     assert growth.rounds >= 36_000 and growth.samples == pytest.approx(36e6, rel=0.01)
-    assert growth.resident_mb < 4.0
-    assert growth.objects < 500
+    # a byte a sample would be 36 MB, an object a round 36,000; a few MB the allocator takes and gives as it likes
+    assert growth.resident_mb < 12.0
+    assert growth.objects < 3000
 
 
 def test_the_bus_going_away_is_not_hidden_by_a_pause(monkeypatch: pytest.MonkeyPatch) -> None:

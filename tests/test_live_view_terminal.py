@@ -64,6 +64,7 @@ def test_a_session_with_every_key(tmp_path: Path) -> None:
         t.press("f")
         t.resize(120, 40)
         t.wait("phase current [A rms]")
+        t.wait("f findings  h help  q quit")
         assert len(t.lines[0]) == 120 and t.lines[-1].startswith("r record")
         assert not t.mode[3] & 2  # canonical input is off: keys come at once
         t.press("q")
