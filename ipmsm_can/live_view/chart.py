@@ -13,7 +13,7 @@ _DOTS = ((0x01, 0x08), (0x02, 0x10), (0x04, 0x20), (0x40, 0x80))
 _LABEL = 7
 
 
-def scale(low: float, high: float, least: float, steps: int = 2) -> tuple[float, float]:
+def scale(low: float, high: float, least: float, steps: int = 4) -> tuple[float, float]:
     """A range of round numbers around low..high, at least `least` wide; NaN stands for no data."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return 0.0, least

@@ -1,10 +1,14 @@
-"""The operator's orders where the compiled loop serves the drive: it hears of them soon enough."""
+"""The live view on a real interface: a full bus, and orders where the compiled loop serves the drive."""
 
 from __future__ import annotations
 
+import re
+import signal
 import threading
 import time
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ipmsm_can.bus.drive_runner import DriveRunner
@@ -17,8 +21,11 @@ from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import RPM, constant
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs import read_log
 from ipmsm_can.motor import M2
 from ipmsm_can.wire.protocol import Protocol, Waveform
+from tests.vcan.test_record import FILLER, SECONDS, cpu_s, full_bus, on_a_terminal, play, told, until
 
 PROTOCOL = Protocol()
 RATE = 2000.0
@@ -83,3 +90,40 @@ def wait(until: object, seconds: float = 60.0) -> None:
     while not until():
         assert time.monotonic() < end, "it never came"
         time.sleep(0.005)
+
+
+def shown(drawn: bytearray) -> int:
+    """Frames received and dropped so far, as the screen says."""
+    text = drawn.decode(errors="replace")
+    return sum(int(found[-1]) for found in (re.findall(r"(\d+) so far", text), re.findall(r"drops (\d+)", text)))
+
+
+@pytest.mark.parametrize(("fd", "load"), [(False, 1.0), (True, 0.6)])
+def test_no_frame_is_lost_with_the_screen_on(fd: bool, load: float, tmp_path: Path) -> None:
+    """As `run` in test_record: answering and recording; here with curves and findings, too."""
+    config, log = tmp_path / "drive.toml", tmp_path / "run.blf"
+    config.write_text('[motor]\npreset = "m2"\n')
+    frames = full_bus(0.5 * SECONDS, fd, load)
+    with on_a_terminal("monitor", str(config), "-i", "socketcan", "-c", "vcan0", "--transmit", "--record",
+                       str(log)) as (process, drawn):
+        until(drawn, b"REC ")
+        used = cpu_s(process.pid)
+        took = play(frames)
+        used = cpu_s(process.pid) - used
+        # on a busy computer it may be behind by now; what waits in the kernel is not lost
+        wait(lambda: shown(drawn) >= len(frames), 120.0)
+        process.send_signal(signal.SIGINT)
+        process.wait(60)
+    text = drawn.decode(errors="replace")
+    drops = told(r"kernel drops (\d+)", text.rsplit("TRANSMITTING for", 1)[1])
+    received = told(r"(\d+) frames received", text)
+    recorded = told(r"recorded (\d+) frames in", text)
+    back = FrameBlock.concat(read_log(log))
+    print(f"\n{len(frames)} frames in {took:.2f} s ({len(frames) / took:.0f}/s), {drops} dropped by the kernel, "
+          f"{received} received, {recorded} recorded, {used / took:.0%} of the processor")
+    assert received == len(frames) - drops
+    assert recorded == len(back) == received + told(r"frames received, (\d+) sent", text)
+    numbers = back.words[back.can_id == FILLER, 1].astype(np.int64)
+    assert (np.diff(numbers) > 0).all(), "nothing twice, and in order"
+    assert "speed [rpm mech.]" in text
+    assert process.returncode == 0
