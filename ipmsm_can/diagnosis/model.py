@@ -37,13 +37,13 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
-_DEAD_ZONE = 0.05
-"""Current in which the sign of a phase's current fades out, as a share of rated current."""
+_DEAD_ZONES = (0.02, 0.05, 0.1, 0.2)
+"""Currents below which the sign of a phase's current may fade out, as shares of rated current."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vectors:
-    """Current [A] and voltage [V] as complex (N,), angle (N,) [rad electrical, unwrapped, NaN unknown], rate [Hz]."""
+    """Current [A], voltage [V]: complex (N,); angle (N,) [rad electrical, unwrapped, NaN unknown]; rate [Hz]."""
 
     i: Complexes
     v: Complexes
@@ -57,9 +57,9 @@ def vectors(m: Measurement, theta: Floats) -> Vectors:
 
 
 def dead_time_direction(i: Complexes, zone: float) -> Complexes:
-    """Voltage vector against the current that dead time makes for 1 V a phase; its sign fades out below zone [A]."""
-    a, b, c = (np.clip(x / zone, -1.0, 1.0) for x in (
-        i.real, -0.5 * i.real + _HALF_SQRT3 * i.imag, -0.5 * i.real - _HALF_SQRT3 * i.imag))
+    """Voltage vector that dead time takes for 1 V a phase; the sign of a current fades out below zone [A]."""
+    a, b, c = (0.5 * x * (3.0 - x * x) for x in (np.clip(phase / zone, -1.0, 1.0) for phase in (
+        i.real, -0.5 * i.real + _HALF_SQRT3 * i.imag, -0.5 * i.real - _HALF_SQRT3 * i.imag)))
     return np.asarray((2.0 * a - b - c) / 3.0 + 1j * (b - c) / math.sqrt(3.0))
 
 
@@ -92,8 +92,8 @@ def core_prior(motor: Motor) -> dict[str, tuple[float, float]]:
     """What may be taken for granted: next to nothing."""
     wide = 3.0
     return {"R": (motor.R, wide * max(motor.R, 1e-3)), "L_s": (motor.L_s, wide * motor.L_s),
-            **{name: (0.0, wide * motor.L_s) for name in ("l.x", "l.y")},
-            **{name: (0.0, wide * motor.psi_m) for name in ("psi.x", "psi.y")}}
+            **dict.fromkeys(("l.x", "l.y"), (0.0, wide * motor.L_s)),
+            **dict.fromkeys(("psi.x", "psi.y"), (0.0, wide * motor.psi_m))}
 
 
 def motor_columns(w: Windows, x: Vectors) -> dict[str, Complexes]:
@@ -107,23 +107,24 @@ def motor_columns(w: Windows, x: Vectors) -> dict[str, Complexes]:
 
 def motor_prior(motor: Motor) -> dict[str, tuple[float, float]]:
     """Within a factor of some, the motor is the one that was told."""
-    return {"R": (motor.R, max(motor.R, 1e-3)), "L_d": (motor.L_d, 0.5 * motor.L_d),
-            "L_q": (motor.L_q, 0.5 * motor.L_q), "psi.x": (motor.psi_m, motor.psi_m), "psi.y": (0.0, motor.psi_m)}
+    return {"R": (motor.R, max(0.5 * motor.R, 1e-3)), "L_d": (motor.L_d, 0.25 * motor.L_d),
+            "L_q": (motor.L_q, 0.25 * motor.L_q), "psi.x": (motor.psi_m, motor.psi_m), "psi.y": (0.0, motor.psi_m)}
 
 
-def error_columns(w: Windows, x: Vectors, motor: Solution, pole_pairs: int, zone: float) -> dict[str, Complexes]:
-    """What each error of size 1 adds, around the motor that was found."""
+def error_columns(w: Windows, x: Vectors, found: Solution, motor: Motor, zone: float) -> dict[str, Complexes]:
+    """What each error of size 1 adds, around the motor as found; the saliency is the one that was told, as i_d may
+    not have moved enough to tell."""
     T_s = 1.0 / x.sample_rate
     turn = np.exp(1j * x.theta)
-    R, psi = motor["R"], motor.pair("psi")
-    L_s, l = 0.5 * (motor["L_d"] + motor["L_q"]), 0.5 * (motor["L_d"] - motor["L_q"])
+    R, psi = found["R"], found.pair("psi")
+    L_s, half = motor.L_s, 0.5 * motor.L_0
     ones = np.full(len(w), w.period, np.complex128)
     mirrored = R * w.i.conj() + L_s * w.change(x.i.conj())
-    salient = l * w.change(turn**2 * x.i)
-    offset = -l * w.change(turn**2)
+    salient = half * w.change(turn**2 * x.i)
+    offset = -half * w.change(turn**2)
     next_v = np.concatenate([x.v[1:], x.v[-1:]])
     late = -T_s * w.change(0.5 * (x.v + next_v))
-    shaft = x.theta / pole_pairs
+    shaft = x.theta / motor.pole_pairs
     return {
         "u.x": ones, "u.y": 1j * ones,
         "dead_time": T_s * w.sum(_between(dead_time_direction(x.i, zone))),
@@ -147,7 +148,7 @@ def fit_core(w: Windows, x: Vectors, motor: Motor) -> Solution:
     return solve(core_columns(w, x), w.v, w.group, core_prior(motor))
 
 
-def fit_all(w: Windows, x: Vectors, motor: Motor, zone: float, volts: float, rounds: int = 3) -> Solution:
+def fit_all(w: Windows, x: Vectors, motor: Motor, zone: float, volts: float, rounds: int = 2) -> Solution:
     """Motor and errors together; some columns depend on the motor, so that a few rounds are needed.
 
     The angle's zero must be right to some 10 deg, and no sign or phase wrong.
@@ -157,7 +158,7 @@ def fit_all(w: Windows, x: Vectors, motor: Motor, zone: float, volts: float, rou
     found = solve(columns, w.v, w.group, motor_prior(motor), noise)
     prior = {**motor_prior(motor), **error_prior(motor, volts)}
     for _ in range(rounds):
-        errors = error_columns(w, x, found, motor.pole_pairs, zone)
+        errors = error_columns(w, x, found, motor, zone)
         found = solve({**columns, **errors}, w.v, w.group, prior, noise)
     return found
 
@@ -167,6 +168,7 @@ def windows_of(m: Measurement, x: Vectors, length: int) -> Windows:
     return make_windows(m, m.usable & np.isfinite(x.theta), length)
 
 
-def dead_zone(motor: Motor) -> float:
-    """Current [A] within which the sign of a phase's current is not trusted."""
-    return _DEAD_ZONE * motor.rated_current
+def dead_zone(w: Windows, x: Vectors, motor: Motor, volts: float) -> float:
+    """Current [A] below which dead time fades out: the one that leaves least unexplained."""
+    zones = [share * motor.rated_current for share in _DEAD_ZONES]
+    return min(zones, key=lambda zone: fit_all(w, x, motor, zone, volts).rms)

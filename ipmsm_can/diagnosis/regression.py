@@ -1,4 +1,4 @@
-"""Linear least squares of complex equations with real unknowns, and errors that hold for residuals alike in groups."""
+"""Linear least squares of complex equations with real unknowns; residuals of one group may be alike."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ Complexes = NDArray[np.complex128]
 Ints = NDArray[np.int64]
 
 _MOST_NOISE = 0.98
+_NOISE_ERROR = 0.1
+"""How well the noise's variance is known, 1-sigma as a share of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +54,8 @@ def solve(columns: dict[str, Complexes], left: Complexes, group: Ints,
 
     columns: complex (W,) by name of the unknown.  group: (W,), residuals of one group may be alike.
     prior: (value, 1-sigma) that is known of every unknown beforehand; what the equations say nothing of keeps it.
-    noise: variance of the noise in a column itself, both axes together.  It would pull the unknown towards 0 (errors
-    in variables), so its share is taken off the normal equations.
+    noise: variance of the noise in a column itself, both axes together.  It would pull the unknown towards 0
+    (errors in variables), so its share is taken off the normal equations.
     """
     names = tuple(columns)
     a = np.stack([np.concatenate([c.real, c.imag]) for c in columns.values()], axis=1)
@@ -66,7 +68,8 @@ def solve(columns: dict[str, Complexes], left: Complexes, group: Ints,
     blurred = np.array([(noise or {}).get(name, 0.0) for name in names]) * spread**2
     gram, right = a.T @ a, a.T @ b0 + n * blurred * known / spread
     # Never more than nearly all of it: the noise is known to some percent only.
-    gram -= np.diag(np.minimum(n * blurred, _MOST_NOISE * np.diag(gram)))
+    taken = np.minimum(n * blurred, _MOST_NOISE * np.diag(gram))
+    gram -= np.diag(taken)
     dof = max(1, len(b) - len(names))
     variance = float(b0 @ b0) / dof
     x = np.zeros(len(names))
@@ -85,5 +88,8 @@ def solve(columns: dict[str, Complexes], left: Complexes, group: Ints,
     # Never less than independent residuals would give: a handful of groups may agree by chance.
     scale = np.sqrt(np.maximum(1.0, np.diag(plain) / np.maximum(np.diag(robust), 1e-300)))
     covariance = robust * np.outer(scale, scale) * np.outer(spread, spread)
+    # What was taken off may have been too much or too little.
+    left_over = np.diag(inverse) * _NOISE_ERROR * taken * (x + known / spread)
+    covariance += np.diag((left_over * spread) ** 2)
     residual = rest[:n] + 1j * rest[n:]
     return Solution(names, x * spread + known, covariance, residual, float(np.sqrt(variance)))

@@ -23,10 +23,13 @@ Floats = NDArray[np.float64]
 LEAST = math.radians(4.0)
 """Step [rad electrical] that counts."""
 _BLOCK_S = 0.012
+_MOST_BLOCKS = 2000
+"""Blocks are longer in a long log."""
 _SHARE = 0.6
 """What a step must leave of the squares, at most."""
-_EDGE = 8
-"""Blocks before and after a step, at least."""
+_EDGE = 3
+"""Blocks before and after a step, and between two of them, at least."""
+_SURE = 6.0
 _MOST = 8
 
 
@@ -62,7 +65,7 @@ def _courses(w: Windows, x: Vectors, motor: Motor, volts: float) -> tuple[NDArra
     dq = x.i * turn.conj()
     rest = w.v - motor.R * w.i - w.change(turn * (motor.L_d * dq.real + 1j * motor.L_q * dq.imag))
     magnet = w.change(turn)
-    n = max(1, round(_BLOCK_S / w.period))
+    n = max(1, round(_BLOCK_S / w.period), -(-len(w) // _MOST_BLOCKS))
     blocks = len(w) // n
     cut = slice(0, blocks * n)
     along = (magnet.conj() * rest)[cut].reshape(blocks, n).sum(axis=1)
@@ -77,37 +80,57 @@ def find_slips(w: Windows, x: Vectors, motor: Motor, volts: float) -> ZeroCourse
     """The steps of the encoder's zero.  volts: what the voltage may be wrong by [V]."""
     row, angle = _courses(w, x, motor, volts)
     slips: list[Slip] = []
-    if row.size >= 2 * _EDGE + 4:
+    if row.size >= 20:
         usual = np.angle(np.exp(1j * angle).mean())
         angle = np.unwrap(np.angle(np.exp(1j * (angle - usual))))
+        # What may move the angle without a slip: the shaft's turns, a late voltage, a wrong L_q.
         shaft = x.theta[row] / motor.pole_pairs
-        known = np.stack([np.ones(row.size), np.cos(shaft), np.sin(shaft)], axis=1)
-        while len(slips) < _MOST:
-            found = _step(known, angle)
+        speed = np.gradient(x.theta)[row]
+        load = (x.i * np.exp(-1j * x.theta)).imag[row]
+        known = np.stack([np.ones(row.size), np.cos(shaft), np.sin(shaft), speed, load], axis=1)
+        taken = np.zeros(row.size, np.bool_)
+        taken[:_EDGE] = taken[row.size - _EDGE:] = True
+        places: list[int] = []
+        while len(places) < _MOST:
+            found = _step(known, angle, taken)
             if found is None:
                 break
-            at, size, sigma = found
-            slips.append(Slip(int(row[at]), -size, sigma))
-            known = np.concatenate([known, (np.arange(row.size) >= at)[:, None]], axis=1)
+            places.append(found)
+            taken[max(0, found - _EDGE):found + _EDGE + 1] = True
+            known = np.concatenate([known, (np.arange(row.size) >= found)[:, None]], axis=1)
+        slips = _sizes(known, angle, row, places)
     # The magnet seems to turn one way where the encoder went the other.
     return ZeroCourse(row, -angle, tuple(sorted(slips, key=lambda s: s.row)))
 
 
-def _step(known: Floats, angle: Floats) -> tuple[int, float, float] | None:
-    """The step that explains most beside what is known: (block, size, sigma), None where none does."""
+def _step(known: Floats, angle: Floats, taken: NDArray[np.bool_]) -> int | None:
+    """The block with the step that explains most beside what is known; None where none does."""
     n = angle.size
-    base, *_ = np.linalg.lstsq(known, angle, rcond=None)
-    rest = angle - known @ base
+    q, _ = np.linalg.qr(known)
+    rest = angle - q @ (q.T @ angle)
     before = float(rest @ rest)
     # Every step at once: each column H(k - c), freed from what is known already (Frisch-Waugh).
-    steps = np.tril(np.ones((n, n)))[:, _EDGE:n - _EDGE]
-    q, _ = np.linalg.qr(known)
+    steps = np.tril(np.ones((n, n)))
     free = steps - q @ (q.T @ steps)
     power = (free**2).sum(axis=0)
-    size = np.divide(free.T @ rest, power, out=np.zeros(power.size), where=power > 1e-9)
-    best = int(np.argmax(size**2 * power))
-    left = before - float(size[best] ** 2 * power[best])
-    if abs(size[best]) < LEAST or left > _SHARE * before:
+    size = np.divide(free.T @ rest, power, out=np.zeros(n), where=power > 1e-6)
+    gain = np.where(taken, 0.0, size**2 * power)
+    best = int(np.argmax(gain))
+    left = max(before - float(gain[best]), 0.0)
+    sigma = math.sqrt(left / max(1, n - known.shape[1] - 1) / max(float(power[best]), 1e-6))
+    if abs(size[best]) < max(LEAST, _SURE * sigma) or left > _SHARE * before:
         return None
-    sigma = math.sqrt(left / max(1, n - known.shape[1] - 1) / power[best])
-    return best + _EDGE, float(size[best]), sigma
+    return best
+
+
+def _sizes(known: Floats, angle: Floats, row: NDArray[np.int64], places: list[int]) -> list[Slip]:
+    """All steps fitted together; those that turn out too small are none."""
+    if not places:
+        return []
+    x, *_ = np.linalg.lstsq(known, angle, rcond=None)
+    rest = angle - known @ x
+    spread = np.linalg.pinv(known.T @ known) * float(rest @ rest) / max(1, angle.size - known.shape[1])
+    first = known.shape[1] - len(places)
+    found = [Slip(int(row[at]), -math.remainder(x[first + k], 2.0 * math.pi),
+                  math.sqrt(max(spread[first + k, first + k], 0.0))) for k, at in enumerate(places)]
+    return [slip for slip in found if abs(slip.angle) >= LEAST]

@@ -16,14 +16,17 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ipmsm_can.diagnosis.model import Vectors, core_columns
+from ipmsm_can.diagnosis.model import Vectors, core_columns, core_prior
 from ipmsm_can.diagnosis.regression import Solution, solve
 from ipmsm_can.diagnosis.windows import Windows
 from ipmsm_can.motor import Motor
+
+Complexes = NDArray[np.complex128]
 
 LESS = 0.5
 """What another wiring must leave unexplained, as a share of the power that the present one does."""
@@ -31,9 +34,10 @@ MORE = 4.0
 """How much more another wiring must leave unexplained for the present one to be confirmed."""
 _WINDOWS = 1500
 _MOST_POLE_PAIRS = 16
-_SURE = 5.0
+_CLEARER = 1.5
+"""How much more every other turn of the current must leave unexplained."""
+_OUTLIER = 8.0
 _SIXTH = math.pi / 3.0
-_STEPS = {0: "", 1: "", 2: "", 3: ""}
 SWAPPED = {0: "b and c", 1: "a and b", 2: "a and c"}
 """Phases swapped, by the thirds of a turn that follow the mirroring."""
 
@@ -47,7 +51,6 @@ class Wiring:
     encoder_ratio: true electrical angle over reported one.
     order_known, sign_known, direction_known: whether the samples tell at all.
     rms, rms_as_is: what is left unexplained with it, and with the wiring as reported [V s a window].
-    clear: no other explanation fits nearly as well.
     """
 
     current_mirrored: bool = False
@@ -115,10 +118,8 @@ def find_wiring(w: Windows, x: Vectors, motor: Motor) -> Wiring:
     mirrored, ratio = chosen
     here = power[chosen]
     best = trials[chosen]
-    length, spread = best.pair("L"), best.pair_sigma("L")
-    sign_known = abs(length) > _SURE * spread and abs(length) > 0.2 * motor.L_s
-    # Only what fits is worth asking for its sign.
-    sixths = round(cmath.phase(length) / _SIXTH) % 6 if sign_known else 0
+    turn = _turn(few, x, mirrored, ratio, motor)
+    sign_known, sixths = turn is not None, turn or 0
     zero = cmath.phase(best.pair("psi"))
     backwards = ratio < 0.0
     told = Wiring(
@@ -130,8 +131,6 @@ def find_wiring(w: Windows, x: Vectors, motor: Motor) -> Wiring:
 
 def _named(w: Wiring, mirrored: bool, backwards: bool, sixths: int, zero: float) -> Wiring:
     """The least that explains the trial: one thing wrong rather than two."""
-    from dataclasses import replace
-
     # The magnet's angle stays where it is if only the current is wrong, and goes with a voltage that is.
     with_voltage = abs(math.remainder(zero - _SIXTH * sixths, 2.0 * math.pi)) < abs(math.remainder(zero,
                                                                                                   2.0 * math.pi))
@@ -142,3 +141,44 @@ def _named(w: Wiring, mirrored: bool, backwards: bool, sixths: int, zero: float)
     if with_voltage:
         return replace(w, voltage_sixths=sixths)
     return replace(w, current_sixths=-sixths % 6)
+
+
+def _turn(w: Windows, x: Vectors, mirrored: bool, ratio: float, motor: Motor) -> int | None:
+    """Sixths of a turn that the current has to be turned on by for the motor as told to explain the voltage; None
+    where that makes no difference.
+
+    R, L_s and the saliency are held to what was told: along a current that keeps its place to the magnet each of
+    them, left free, would stand for a turn of it.
+    """
+    current, charge = (x.i.conj(), w.i.conj()) if mirrored else (x.i, w.i)
+    prior = core_prior(motor)
+    prior = {name: prior[name] for name in ("psi.x", "psi.y")}
+    kept = np.ones(len(w), np.bool_)
+    power: list[float] = []
+    for sixth in range(6):
+        turn = cmath.rect(1.0, _SIXTH * sixth)
+        columns = core_columns(w, Vectors(turn * current, x.v, ratio * x.theta, x.sample_rate))
+        magnet = {name: columns[name] for name in prior}
+        rest = w.v - motor.R * turn * charge - motor.L_s * columns["L_s"]
+        zero = cmath.phase(_fitted(magnet, rest, w, kept, prior).pair("psi"))
+        rest = rest - 0.5 * motor.L_0 * cmath.rect(1.0, 2.0 * zero) * columns["l.x"]
+        left = _fitted(magnet, rest, w, kept, prior)
+        if sixth == 0:
+            # A window in which the encoder slips would outweigh all that the current explains.
+            kept = np.abs(left.residual) <= _OUTLIER * np.median(np.abs(left.residual))
+            left = _fitted(magnet, rest, w, kept, prior)
+        power.append(left.rms**2)
+    best = int(np.argmin(power))
+    others = min(p for k, p in enumerate(power) if k != best)
+    return best if others > _CLEARER * power[best] else None
+
+
+def _fitted(columns: dict[str, Complexes], left: Complexes, w: Windows, kept: NDArray[np.bool_],
+            prior: dict[str, tuple[float, float]]) -> Solution:
+    return solve({name: c[kept] for name, c in columns.items()}, left[kept], w.group[kept], prior)
+
+
+def inductance_turn(w: Windows, x: Vectors, motor: Motor) -> int | None:
+    """Sixths of a turn by which the current was turned before it was reported; None where nothing tells."""
+    turn = _turn(_thinned(w), x, False, 1.0, motor)
+    return None if turn is None else -turn % 6
