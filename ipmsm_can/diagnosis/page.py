@@ -50,9 +50,9 @@ i.current{color:var(--current)}i.probe{color:var(--probe)}
 .up,.across{position:relative;font-size:12px;color:var(--muted);font-variant-numeric:tabular-nums}
 .up span{position:absolute;right:6px;transform:translateY(-50%)}
 .across{height:18px;margin-left:52px}.across span{position:absolute;transform:translateX(-50%)}
-.area{position:relative;border-left:1px solid var(--line);border-bottom:1px solid var(--line);touch-action:pan-y;
-cursor:crosshair}
-.area svg{display:block;width:100%;height:100%}
+.area{position:relative;overflow:hidden;border-left:1px solid var(--line);border-bottom:1px solid var(--line);
+touch-action:pan-y;cursor:crosshair}
+.area svg{position:absolute;inset:0;width:100%;height:100%}
 .mark{position:absolute;top:0;bottom:0;background:var(--estimate);opacity:.18}
 path{fill:none;vector-effect:non-scaling-stroke;stroke-linejoin:round;stroke-width:1.6px}
 path.dots{stroke-width:4.5px;stroke-linecap:round;opacity:.75}
@@ -91,8 +91,8 @@ def build(report: Report) -> str:
         f'<h1>{escape(_headline(report))}</h1><p class="muted">{escape(report.source)}</p>'
         f'<dl class="facts">{facts}</dl>{findings}{_checked(report.checked)}{measured}'
         f"<footer>ipmsm-can {escape(__version__)} diagnose. Angles and speeds are electrical, voltages and "
-        "currents peak per phase, unless said otherwise. Drag across a plot to look closer, double click to see all of it; "
-        "with Ctrl or Shift the wheel zooms.</footer></main>"
+        "currents peak per phase, unless said otherwise. Drag across a plot to look closer, double click to see "
+        "all of it; with Ctrl or Shift the wheel zooms.</footer></main>"
         f"<script>{script}</script></body></html>\n")
 
 
@@ -105,8 +105,9 @@ def _finding(f: Finding, numbers: object) -> str:
     rows = "".join(f"<tr><th>{escape(e.label)}</th><td>{_value(e)}</td></tr>" for e in f.evidence)
     table = f"<table>{rows}</table>" if rows else ""
     plot = draw(f.plot, next(numbers)) if f.plot is not None else ""  # type: ignore[call-overload]
+    title = escape(f.title[0].upper() + f.title[1:])
     return (f'<section class="finding {f.severity}" id="{escape(f.code)}"><div class="badge">'
-            f"<b>{_SIGN[f.severity]}</b>{_WORD[f.severity]}<i>{escape(f.code)}</i></div><h2>{escape(f.title[0].upper() + f.title[1:])}</h2>"
+            f"<b>{_SIGN[f.severity]}</b>{_WORD[f.severity]}<i>{escape(f.code)}</i></div><h2>{title}</h2>"
             f'<p>{escape(f.sentence)}</p><p class="do">{escape(f.advice)}</p>{table}{plot}</section>')
 
 

@@ -40,7 +40,8 @@ def draw(plot: Plot, number: int) -> str:
         f'<ul class="key">{keys}</ul></figcaption>'
         f'<div class="unit">{escape(plot.y_label)}</div><div class="frame"><div class="up">{up}</div>'
         f'<div class="area"><svg viewBox="{x0:.6g} {-y1:.6g} {x1 - x0:.6g} {y1 - y0:.6g}" '
-        f'preserveAspectRatio="none" role="img" aria-label="{escape(plot.title)}"><g class="lines">{grid}</g>{paths}</svg></div></div>'
+        f'preserveAspectRatio="none" role="img" aria-label="{escape(plot.title)}"><g class="lines">{grid}</g>'
+        f"{paths}</svg></div></div>"
         f'<div class="across">{across}</div><div class="xlabel">{escape(plot.x_label)}</div></figure>')
 
 

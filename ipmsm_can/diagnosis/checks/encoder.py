@@ -90,7 +90,8 @@ def _slips(case: Case) -> tuple[list[Finding], list[Checked]]:
         "deg electrical at most. From then on its angle is wrong.",
         "Check the encoder's fastening on the shaft, its cable and its index pulse; then find the zero anew.",
         numbers, _course_plot(case, "An encoder that holds gives one level."),
-        size=abs(largest.angle) / limits.SLIP_ERROR, order=1)], [Checked("encoder slips", "found", often)]
+        size=abs(largest.angle) / limits.SLIP_ERROR, order=1)], [
+            Checked("encoder slips", "found", f"by {largest.angle * DEGREES:+.1f} deg electrical")]
 
 
 def _zero(case: Case) -> tuple[list[Finding], list[Checked]]:
