@@ -176,6 +176,12 @@ class Case:
         return Vectors(x.i, x.v, self.observed.angle, self.m.sample_rate)
 
     @cached_property
+    def noise(self) -> float:
+        """Noise of the current samples [A rms per axis]; as drive.toml tells where the drive always probes."""
+        found = model.current_noise(self.vectors, self.usable & ~self.m.injecting)
+        return found if math.isfinite(found) else self.config.observer.current_noise
+
+    @cached_property
     def zero_course(self) -> ZeroCourse | None:
         """The encoder's zero over time; None without an encoder that turns."""
         if not self.by_encoder:
@@ -218,8 +224,8 @@ class Case:
         for _ in range(_ROUNDS):
             x = undone.apply(raw, self.motor.pole_pairs)
             w = self._windows(x, known)
-            zone = zone or model.dead_zone(w, x, self.motor, _MOST_VOLTS * self.volts)
-            s = model.fit_all(w, x, self.motor, zone, _MOST_VOLTS * self.volts)
+            zone = zone or model.dead_zone(w, x, self.motor, _MOST_VOLTS * self.volts, self.noise)
+            s = model.fit_all(w, x, self.motor, zone, _MOST_VOLTS * self.volts, self.noise)
             step = self._step(s)
             if best is not None and s.rms > best.solution.rms:
                 break

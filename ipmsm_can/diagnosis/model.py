@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
+_LEAST_DIFFERENCES = 200
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 _DEAD_ZONES = (0.02, 0.05, 0.1, 0.2)
 """Currents below which the sign of a phase's current may fade out, as shares of rated current."""
@@ -78,12 +79,13 @@ def core_columns(w: Windows, x: Vectors) -> dict[str, Complexes]:
             "psi.y": 1j * magnet}
 
 
-def current_noise(x: Vectors) -> float:
-    """Noise of the current samples [A rms per axis], from their second differences in the rotor's frame."""
+def current_noise(x: Vectors, quiet: NDArray[np.bool_]) -> float:
+    """Noise of the current samples [A rms per axis], from their second differences in the rotor's frame; NaN where
+    there are too few.  quiet (N,): samples that may be used, without a probing signal."""
     i = x.i * np.exp(-1j * np.where(np.isfinite(x.theta), x.theta, 0.0))
-    second = np.diff(i, 2)
-    if not second.size:
-        return 0.0
+    second = np.diff(i, 2)[quiet[2:] & quiet[1:-1] & quiet[:-2]]
+    if second.size < _LEAST_DIFFERENCES:
+        return math.nan
     spread = np.median(np.abs(np.concatenate([second.real, second.imag])))
     return float(1.4826 * spread / math.sqrt(6.0))
 
@@ -148,12 +150,15 @@ def fit_core(w: Windows, x: Vectors, motor: Motor) -> Solution:
     return solve(core_columns(w, x), w.v, w.group, core_prior(motor))
 
 
-def fit_all(w: Windows, x: Vectors, motor: Motor, zone: float, volts: float, rounds: int = 2) -> Solution:
+def fit_all(w: Windows, x: Vectors, motor: Motor, zone: float, volts: float, sigma: float,
+            rounds: int = 2) -> Solution:
     """Motor and errors together; some columns depend on the motor, so that a few rounds are needed.
 
+    zone: current in which dead time fades out [A].  volts: largest error of the voltage thought of [V].
+    sigma: noise of the current samples [A rms per axis].
     The angle's zero must be right to some 10 deg, and no sign or phase wrong.
     """
-    noise = dict.fromkeys(("L_d", "L_q"), 2.0 * current_noise(x) ** 2)
+    noise = dict.fromkeys(("L_d", "L_q"), 2.0 * sigma**2)
     columns = motor_columns(w, x)
     found = solve(columns, w.v, w.group, motor_prior(motor), noise)
     prior = {**motor_prior(motor), **error_prior(motor, volts)}
@@ -168,7 +173,7 @@ def windows_of(m: Measurement, x: Vectors, length: int) -> Windows:
     return make_windows(m, m.usable & np.isfinite(x.theta), length)
 
 
-def dead_zone(w: Windows, x: Vectors, motor: Motor, volts: float) -> float:
+def dead_zone(w: Windows, x: Vectors, motor: Motor, volts: float, sigma: float) -> float:
     """Current [A] below which dead time fades out: the one that leaves least unexplained."""
     zones = [share * motor.rated_current for share in _DEAD_ZONES]
-    return min(zones, key=lambda zone: fit_all(w, x, motor, zone, volts).rms)
+    return min(zones, key=lambda zone: fit_all(w, x, motor, zone, volts, sigma).rms)

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.diagnosis import limits, model
+from ipmsm_can.diagnosis import limits
 from ipmsm_can.diagnosis.case import Case
 from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding
 from ipmsm_can.experiments.conditions import window_levels
@@ -33,7 +33,7 @@ def required(case: Case) -> float:
 def levels(case: Case) -> tuple[NDArray[np.float64], Bools, Bools]:
     """C1's level [V^2 s] of every window, whether the rotor stood in it, and whether the drive probed in it."""
     m, motor, x = case.m, case.motor, case.vectors
-    noise = model.current_noise(x)
+    noise = case.noise
     found, stood, probed = [], [], []
     for begin, end in case.runs:
         span = slice(begin, end)
