@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ipmsm_can.bus.replay import NodeSummary, Replay
     from ipmsm_can.bus.rows import RowBlock, RowFile
     from ipmsm_can.config import DriveConfig
@@ -60,7 +58,6 @@ replayed, and one sentence says what was wrong
 
 _PROGRESS_S = 0.2
 _BLOCK_FRAMES = 65536
-_IDS_SHOWN = 12
 _MARKS_SHOWN = 20
 
 
@@ -306,29 +303,8 @@ def _share(part: int, whole: int) -> str:
 
 def _absence(config: DriveConfig, replay: Replay, protocol: Protocol, log: Path, channel: str | None) -> str:
     """Why there is not one row of this drive, in one sentence."""
-    from ipmsm_can.wire.protocol import MessageKind
+    from ipmsm_can.bus.absence import absence
 
-    number = config.wire.node
-    came = replay.sample_frames(number)
-    node = replay.companion.nodes[number]
-    if came and node.receiver.sequencer.waiting:
-        return (f"{log} holds {came} sample frames of node {number} but no DriveTiming, so their rate is unknown; "
-                "set wire.sample_rate in the drive's TOML file")
-    if came:
-        return (f"none of the {came} sample frames of node {number} in {log} could be used "
-                f"({node.bad_frames} bad)")
-    ids = " and ".join(f"0x{protocol.base_ids[kind] + number:X}"
-                       for kind in (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK))
-    if channel is not None and not (replay.standard_ids.any() or replay.extended_ids):
-        return f"{log} holds no frame of channel {channel!r}; without --channel those of every channel are taken"
-    where = "" if channel is None else f" on channel {channel!r}"
-    return (f"{log} holds no sample frame of node {number}{where} (identifiers {ids}); "
-            f"seen were {_ids_seen(replay.standard_ids, replay.extended_ids)}")
-
-
-def _ids_seen(standard: np.ndarray[Any, np.dtype[np.int64]], extended: set[int]) -> str:
-    names = [f"0x{k:X}" for k in standard.nonzero()[0].tolist()] + [f"0x{k:08X}" for k in sorted(extended)]
-    if not names:
-        return "no identifiers at all"
-    more = f" and {len(names) - _IDS_SHOWN} more" if len(names) > _IDS_SHOWN else ""
-    return ", ".join(names[:_IDS_SHOWN]) + more
+    node = replay.companion.nodes[config.wire.node]
+    waiting = node.receiver.sequencer.waiting
+    return absence(node.number, replay.seen, protocol, waiting, node.bad_frames, log, channel)
