@@ -34,7 +34,7 @@ from ipmsm_can.wire.protocol import Protocol
 from tests.vcan.test_reconnect import Sender, ip, traffic, vcan7  # noqa: F401
 
 PROGRAM = [sys.executable, "-m", "ipmsm_can"]
-FILLER = 0x3FF
+FILLER = 0x5FF
 SECONDS = float(os.environ.get("IPMSM_CAN_SECONDS", "6"))
 
 
@@ -58,7 +58,7 @@ def full_bus(seconds: float, fd: bool, load: float) -> FrameBlock:
     node = DriveNode(Protocol(), 0, simulation, DriveNodeSettings(fd=fd, reference_rate=200.0))
     drive = node.step(int(simulation.parameters.sample_rate * seconds)).frames
 
-    def lasts(block: FrameBlock) -> np.ndarray:  # type: ignore[type-arg]
+    def lasts(block: FrameBlock) -> np.ndarray:
         nominal, data = frame_bits(block)
         return nominal / 1e6 + data / 5e6
 
@@ -132,6 +132,16 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
+def caught_up(log: Path) -> None:
+    """Wait until a recording grows no more: on one slow processor the program may lag behind by what waits in the
+    kernel."""
+    size, since = -1, time.monotonic()
+    while time.monotonic() < since + 3.0:
+        if log.stat().st_size != size:
+            size, since = log.stat().st_size, time.monotonic()
+        time.sleep(0.1)
+
+
 def told(pattern: str, text: str) -> int:
     match = re.search(pattern, text)
     assert match, text[-3000:]
@@ -143,23 +153,24 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
 
 
-@pytest.mark.parametrize(("fd", "load", "suffix"), [(False, 1.0, ".blf"), (False, 1.0, ".log"), (True, 0.6, ".blf")])
+@pytest.mark.parametrize(("fd", "load", "suffix", "answer"), [
+    (False, 1.0, ".blf", False), (False, 1.0, ".log", True), (True, 0.6, ".blf", True)])
 def test_no_frame_is_lost_that_the_kernel_delivered(config: Path, tmp_path: Path, fd: bool, load: float,
-                                                    suffix: str) -> None:
-    """Classical at 1 Mbit/s saturated, FD at 60 %; the companion answers, its screen is on, and it records."""
+                                                    suffix: str, answer: bool) -> None:
+    """Classical at 1 Mbit/s saturated, FD at 60 %; the companion's screen is on, it records, and answers or not."""
     frames = full_bus(SECONDS, fd, load)
     log = tmp_path / f"run{suffix}"
-    with on_a_terminal("run", str(config), "-i", "socketcan", "-c", "vcan0", "--transmit", "--record",
-                       str(log)) as (process, drawn):
+    with on_a_terminal("run", str(config), "-i", "socketcan", "-c", "vcan0", "--record", str(log),
+                       *(["--transmit"] if answer else [])) as (process, drawn):
         until(drawn, b"REC ")
         used = cpu_s(process.pid)
         took = play(frames)
         used = cpu_s(process.pid) - used
-        time.sleep(1.0)
+        caught_up(log)
         process.send_signal(signal.SIGINT)
         process.wait(60)
     text = drawn.decode(errors="replace")
-    drops = told(r"kernel drops (\d+)", text.rsplit("TRANSMITTING for", 1)[1])
+    drops = told(r"kernel drops (\d+)", text[text.rindex(" frames received, "):])
     received = told(r"(\d+) frames received", text)
     answers = told(r"frames received, (\d+) sent", text)
     recorded = told(r"recorded (\d+) frames in", text)
@@ -192,7 +203,7 @@ def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> No
         time.sleep(0.5)
         frames = full_bus(1.0, False, 0.9)
         play(frames)
-        time.sleep(1.0)
+        caught_up(log)
         process.send_signal(signal.SIGINT)
         process.wait(60)
     text = drawn.decode(errors="replace")
