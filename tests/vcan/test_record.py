@@ -133,13 +133,14 @@ def config(tmp_path: Path) -> Path:
 
 
 def caught_up(log: Path) -> None:
-    """Wait until a recording grows no more: on one slow processor the program may lag behind by what waits in the
-    kernel."""
-    size, since = -1, time.monotonic()
+    """Wait until no more of our frames come into a recording: on one slow processor the program may lag behind by
+    what waits in the kernel."""
+    count, since = -1, time.monotonic()
     while time.monotonic() < since + 3.0:
-        if log.stat().st_size != size:
-            size, since = log.stat().st_size, time.monotonic()
-        time.sleep(0.1)
+        found = sum(int(np.count_nonzero(b.can_id == FILLER)) for b in read_log(log))
+        if found != count:
+            count, since = found, time.monotonic()
+        time.sleep(0.5)
 
 
 def told(pattern: str, text: str) -> int:
