@@ -62,7 +62,11 @@ def run_mapped(args: argparse.Namespace) -> int:
 
         listener = Listener(link, health, isinstance(port, SocketCanPort), not args.no_reconnect, observe)
         monitor = MappedMonitor(listener, follower, tap)
-        code, status = bus.serve("run", lambda: listener.run(stop), monitor.status, args.quiet)
+        def listen() -> None:
+            listener.run(stop)
+            follower.flush()
+
+        code, status = bus.serve("run", listen, monitor.status, args.quiet)
     _tell(follower, status.elapsed)
     if link.down:
         print(f"ipmsm-can run: there is {link.words}", file=sys.stderr)

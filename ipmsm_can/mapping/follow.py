@@ -13,7 +13,7 @@ import numpy as np
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.mapping.check import abilities, doubtful, missing
-from ipmsm_can.mapping.mapper import Mapper
+from ipmsm_can.mapping.mapper import MappedBlock, Mapper
 from ipmsm_can.mapping.plan import Plan
 from ipmsm_can.mapping.steady import SteadyState
 from ipmsm_can.mapping.survey import Survey
@@ -21,6 +21,8 @@ from ipmsm_can.mapping.track import MappedTracking
 
 LOOK_S = 2.0
 """How long the signals are looked at [s], from the first frame of the map."""
+
+_NOTHING_CAME = "no frame of the map has come yet"
 
 
 class Follower:
@@ -37,7 +39,7 @@ class Follower:
         self.plan = plan
         self.tracking: MappedTracking | None = None
         self.steady: SteadyState | None = None
-        self.verdict = "no frame of the map has come yet"
+        self.verdict = _NOTHING_CAME
         self.notes: list[str] = []
         self.samples = 0
         self.last_ns = 0
@@ -58,7 +60,7 @@ class Follower:
         if not len(block):
             return
         if self._mapper is not None:
-            self._follow(self._mapper, block)
+            self._take(self._mapper.feed(block))
             return
         self._look(block)
 
@@ -68,7 +70,8 @@ class Follower:
             if not ours.size and self.plan.map.map.identifiers != "either length":
                 return
             self._from_ns = int(block.t_ns[ours[0] if ours.size else 0])
-            self.verdict = "looking at the signals"
+            if self.verdict == _NOTHING_CAME:
+                self.verdict = "looking at the signals"
         late = np.flatnonzero(block.t_ns > self._from_ns + self._look_ns)
         cut = int(late[0]) if late.size else len(block)
         self._held.append(block.take(slice(0, cut)))
@@ -79,6 +82,15 @@ class Follower:
             else:
                 self._from_ns = None
             self.feed(block.take(slice(cut, None)))
+
+    def flush(self) -> None:
+        """No more frames will come: decide by what there is, and take in what waits for later reports."""
+        if self._held:
+            held, self._held = FrameBlock.concat(self._held), []
+            if self._decide(held):
+                self.feed(held)
+        if self._mapper is not None:
+            self._take(self._mapper.flush())
 
     def _decide(self, held: FrameBlock) -> bool:
         survey = Survey(self.plan, self.config.wire.sample_rate)
@@ -97,8 +109,7 @@ class Follower:
         self._mapper = Mapper(self.plan, survey.rate)
         return True
 
-    def _follow(self, mapper: Mapper, block: FrameBlock) -> None:
-        part = mapper.feed(block)
+    def _take(self, part: MappedBlock) -> None:
         if not len(part):
             return
         self.samples += len(part)
