@@ -219,7 +219,7 @@ def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> No
 def test_twenty_outages_during_a_recording(vcan7: str, tmp_path: Path) -> None:  # noqa: F811
     """Down and up, or away and made anew: complete but for the gaps, and every gap is marked."""
     log = tmp_path / "run.blf"
-    sender = Sender(traffic(240.0))
+    sender = Sender(traffic(120.0))
     process = subprocess.Popen([*PROGRAM, "record", str(log), "-i", "socketcan", "-c", vcan7],
                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                                env={**os.environ, "PYTHONUNBUFFERED": "1"})
