@@ -26,6 +26,7 @@ from ipmsm_can.motor import M2
 from ipmsm_can.node import Tracked
 from ipmsm_can.record import measure
 from ipmsm_can.record.measure import SAMPLE_CHANNELS, MeasureFile, MeasureRecorder
+from ipmsm_can.wire.codec import SignalLayout
 from ipmsm_can.wire.dbc import default_dbc_path
 from ipmsm_can.wire.protocol import Protocol
 
@@ -169,6 +170,14 @@ def test_live_in_a_thread_and_never_over_a_file(config: DriveConfig, frames: Fra
     assert [p.name for p in tmp_path.iterdir()] == ["run.mf4"], "no temporary file is left"
     with pytest.raises(LogError, match="exists, and recordings are never overwritten"):
         MeasureRecorder(path, [0], PROTOCOL)
+
+
+def test_offsets_and_words_of_a_signal() -> None:
+    temperature = SignalLayout("t", 0, 8, scale=0.5, offset=-40.0, unit="degC", choices={255: "broken"})
+    kind, conversion = measure._stored(temperature)
+    assert kind == np.uint8 and conversion == {"a": 0.5, "b": -40.0}
+    assert measure._about(temperature) == "(87.5: broken)"
+    assert measure._stored(SignalLayout("n", 0, 12, kind="signed")) == (np.dtype(np.int16), None)
 
 
 def test_where_it_cannot_be_made(tmp_path: Path) -> None:
