@@ -162,7 +162,8 @@ def test_no_frame_is_lost_that_the_kernel_delivered(config: Path, tmp_path: Path
     frames = full_bus(SECONDS, fd, load)
     log = tmp_path / f"run{suffix}"
     with on_a_terminal("run", str(config), "-i", "socketcan", "-c", "vcan0", "--record", str(log),
-                       *(["--transmit"] if answer else [])) as (process, drawn):
+                       *(["--transmit"] if answer else []),
+                       *(["--measure", str(tmp_path / "run.mf4")] if fd else [])) as (process, drawn):
         until(drawn, b"REC ")
         used = cpu_s(process.pid)
         took = play(frames)
@@ -189,6 +190,12 @@ def test_no_frame_is_lost_that_the_kernel_delivered(config: Path, tmp_path: Path
         found = np.concatenate([found[back.can_id[~ours] != FILLER], found[back.can_id[~ours] == FILLER]])
         assert np.array_equal(found, expected), "every frame, in order, to the last bit"
     assert process.returncode == 0
+    if fd:
+        from asammdf import MDF
+
+        with MDF(tmp_path / "run.mf4") as file:
+            filled = file.get("filled", group=0).samples
+            assert len(filled) >= 0.99 * 10_000 * SECONDS and (drops or not filled.any())
 
 
 def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> None:
