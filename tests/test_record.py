@@ -152,6 +152,18 @@ def test_rotation_by_size_numbers_on_and_loses_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "run_006.blf").read_bytes() == b"somebody else's"
 
 
+def test_rotation_of_a_format_that_is_put_together_at_the_end(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run.mf4", "can0", Rotation(size=2_000_000.0), flush_s=0.01)
+    for k in range(6):
+        recorder.take(frames(10_000, 10_000 * k), (), NOTHING)
+        deadline = time.monotonic() + 60
+        while recorder.status().waiting and time.monotonic() < deadline:
+            time.sleep(0.01)
+    recorder.close()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 1 and [n for path in files for n in numbers(path)] == list(range(60_000))
+
+
 def test_rotation_by_the_time_of_the_frames(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "run.log.gz", "can0", Rotation(seconds=2.0), flush_s=0.01)
     for k in range(7):
