@@ -26,6 +26,7 @@ from ipmsm_can.motor import M2
 from ipmsm_can.node import Tracked
 from ipmsm_can.record import measure
 from ipmsm_can.record.measure import SAMPLE_CHANNELS, MeasureFile, MeasureRecorder
+from ipmsm_can.wire.codec import SignalLayout
 from ipmsm_can.wire.dbc import default_dbc_path
 from ipmsm_can.wire.protocol import Protocol
 
@@ -79,7 +80,8 @@ def decoded(frames: FrameBlock, name: str) -> tuple[np.ndarray[Any, Any], list[d
     """Times [ns] and signals of a message, by cantools."""
     message = DATABASE.get_message_by_name(name)
     rows = np.flatnonzero(frames.can_id == message.frame_id)
-    return frames.t_ns[rows], [message.decode(frames.data[r, :message.length].tobytes()) for r in rows]
+    return frames.t_ns[rows], [
+        message.decode(frames.data[r, :message.length].tobytes(), decode_choices=False) for r in rows]
 
 
 def test_every_message_as_cantools_decodes_it(config: DriveConfig, frames: FrameBlock, tmp_path: Path,
@@ -100,10 +102,11 @@ def test_every_message_as_cantools_decodes_it(config: DriveConfig, frames: Frame
                 assert channel.unit == (signal.unit or "")
                 assert np.abs(channel.timestamps - 1e-9 * (t_ns - frames.t_ns[0])).max() < 1e-9
                 wanted = [row[signal.name] for row in expected]
-                if signal.choices:
-                    assert [v.decode() for v in channel.samples.tolist()] == [str(v) for v in wanted]
+                if signal.choices and signal.scale == 1.0:
+                    words = [str(signal.choices.get(v, "")) for v in wanted]
+                    assert [v.decode() for v in channel.samples.tolist()] == words
                 else:
-                    assert channel.samples.tolist() == pytest.approx([float(v) for v in wanted], rel=1e-14, abs=0)
+                    assert channel.samples.tolist() == pytest.approx(wanted, rel=1e-14, abs=0)
 
 
 def test_samples_and_estimates_on_the_time_of_the_counter(config: DriveConfig, frames: FrameBlock,
@@ -167,6 +170,14 @@ def test_live_in_a_thread_and_never_over_a_file(config: DriveConfig, frames: Fra
     assert [p.name for p in tmp_path.iterdir()] == ["run.mf4"], "no temporary file is left"
     with pytest.raises(LogError, match="exists, and recordings are never overwritten"):
         MeasureRecorder(path, [0], PROTOCOL)
+
+
+def test_offsets_and_words_of_a_signal() -> None:
+    temperature = SignalLayout("t", 0, 8, scale=0.5, offset=-40.0, unit="degC", choices={255: "broken"})
+    kind, conversion = measure._stored(temperature)
+    assert kind == np.uint8 and conversion == {"a": 0.5, "b": -40.0}
+    assert measure._about(temperature) == "(87.5: broken)"
+    assert measure._stored(SignalLayout("n", 0, 12, kind="signed")) == (np.dtype(np.int16), None)
 
 
 def test_where_it_cannot_be_made(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -27,6 +28,7 @@ from ipmsm_can.record.background import Background
 from ipmsm_can.record.recorder import Recorder
 from ipmsm_can.record.rotation import Names, Rotation
 from ipmsm_can.record.tap import Tap
+from tests.test_blf import a_file, an_object
 
 NOW = 1_700_000_000_123_456_000
 NOTHING = FrameBlock.zeros(0)
@@ -109,6 +111,17 @@ def test_a_gap_is_marked_in_or_beside_every_format(tmp_path: Path, suffix: str) 
     assert abs(gap.began_ns - NOW - 10**9) < 1000
 
 
+def test_a_marker_in_units_of_ten_microseconds(tmp_path: Path) -> None:
+    """As Vector's tools may write it."""
+    path = tmp_path / "run.blf"
+    body = struct.pack("<LLL3xBLLL12x", 0, 0, 0, 0, 2, 4, 3) + b"grpnamewhy"
+    path.write_bytes(a_file(an_object(96, body, ticks=150_000, flags=1)
+                            + an_object(1, struct.pack("<HBBL8s", 1, 0, 1, 0x10, b"\1"), ticks=1_500_000_000)))
+    reader = read_log(path)
+    (block,) = list(reader)
+    assert [(m.text, m.t_ns) for m in reader.marks] == [("gr - pnam - ewh", int(block.t_ns[0]))]
+
+
 def test_frames_sent_stand_behind_what_they_answer_and_are_told_apart(tmp_path: Path) -> None:
     received, sent = frames(4), frames(2, 100)
     sent.t_ns[:] = received.t_ns[[0, 2]]
@@ -137,6 +150,18 @@ def test_rotation_by_size_numbers_on_and_loses_nothing(tmp_path: Path) -> None:
     assert [n for path in files for n in numbers(path)] == list(range(20_000))
     assert recorder.status().size == sum(p.stat().st_size for p in files)
     assert (tmp_path / "run_006.blf").read_bytes() == b"somebody else's"
+
+
+def test_rotation_of_a_format_that_is_put_together_at_the_end(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "run.mf4", "can0", Rotation(size=2_000_000.0), flush_s=0.01)
+    for k in range(6):
+        recorder.take(frames(10_000, 10_000 * k), (), NOTHING)
+        deadline = time.monotonic() + 60
+        while recorder.status().waiting and time.monotonic() < deadline:
+            time.sleep(0.01)
+    recorder.close()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) > 1 and [n for path in files for n in numbers(path)] == list(range(60_000))
 
 
 def test_rotation_by_the_time_of_the_frames(tmp_path: Path) -> None:
@@ -242,35 +267,32 @@ from ipmsm_can.record.recorder import Recorder
 from tests.test_record import frames
 recorder = Recorder(sys.argv[1], "can0")
 k = 0
-begin = time.monotonic()
 while True:
     recorder.take(frames(10, 10 * k), (), FrameBlock.zeros(0))
     k += 1
-    print(10 * k, time.monotonic(), flush=True)
+    print(recorder.status().frames, flush=True)
     time.sleep(0.01)
 """
 
 
 @pytest.mark.parametrize("suffix", [".blf", ".log.gz"])
-def test_a_killed_program_leaves_a_file_that_is_whole_up_to_a_second_before(tmp_path: Path, suffix: str) -> None:
+def test_a_killed_program_leaves_all_that_was_written(tmp_path: Path, suffix: str) -> None:
+    """Twice a second what has come is written; whatever the program had counted as written is in the file."""
     path = tmp_path / f"run{suffix}"
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True,
                                cwd=Path(__file__).parents[1])
     assert process.stdout is not None
-    taken: list[tuple[int, float]] = []
+    written = {0}
     for line in process.stdout:
-        count, at = line.split()
-        taken.append((int(count), float(at)))
-        if float(at) - taken[0][1] > 1.8:
+        written.add(int(line))
+        if len(written) > 3:
             break
     os.kill(process.pid, signal.SIGKILL)
-    killed = time.monotonic()
-    taken += [(int(a), float(b)) for a, b in (line.split() for line in process.stdout if line.endswith("\n"))]
+    written |= {int(line) for line in process.stdout if line.endswith("\n")}
     process.wait()
     found = numbers(path)
     assert found == list(range(len(found)))
-    early = [count for count, at in taken if at < killed - 1.0]
-    assert len(found) >= early[-1] > 0
+    assert len(found) >= max(written) > 0
 
 
 class _Broken:

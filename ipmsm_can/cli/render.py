@@ -21,7 +21,7 @@ def render(status: Status, width: int, height: int) -> Text:
     if isinstance(status, HealthStatus):
         badge = Text(f" {plain.SILENT} ", style="reverse")
         lines = _header(status.title, badge, status.elapsed, status.report.source, width)
-        lines[2:2] = _records(status.records)
+        lines[2:2] = _records(status.records, width)
         lines += health_lines(status.report, width, height - len(lines))
     else:
         lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
@@ -35,7 +35,7 @@ def render(status: Status, width: int, height: int) -> Text:
 def _run(status: RunStatus, width: int, height: int) -> list[Text]:
     badge = Text(f" {plain.voice(status)} ", style="bold black on yellow" if status.transmit else "reverse")
     lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
-    lines[2:2] = _records(status.records)
+    lines[2:2] = _records(status.records, width)
     if status.bus.no_bus:
         told = textwrap.wrap(status.bus.no_bus, max(20, width - 2))
         lines[-1:] = [*(Text(f"  {part}", style="bold red") for part in told[:_ERROR_LINES]), Text()]
@@ -70,8 +70,9 @@ def _header(title: str, badge: Text, elapsed: float, description: str, width: in
     return [first, second, Text()]
 
 
-def _records(records: tuple[RecordStatus, ...]) -> list[Text]:
-    return [Text(one.words, style="bold green" if one.whole else "bold red") for one in records]
+def _records(records: tuple[RecordStatus, ...], width: int) -> list[Text]:
+    return [Text(part, style="bold green" if one.whole else "bold red")
+            for one in records for part in textwrap.wrap(one.words, width)]
 
 
 def _labelled(label: str, *parts: str | tuple[str, str] | Text) -> Text:

@@ -24,6 +24,7 @@ examples:
   ipmsm-can run drive.toml -i socketcan -c can0 --transmit    answer: position, status, probing commands
   ipmsm-can run left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000 --duration 60
   ipmsm-can run drive.toml -i socketcan -c can0 --record run.blf --measure run.mf4
+  ipmsm-can run drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm
   CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
 
 On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.
@@ -38,6 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("configs", nargs="+", metavar="drive.toml", help="configuration of a drive, one file each")
     parser.add_argument("--transmit", action="store_true",
                         help="send estimates, status and injection commands; without it nothing is ever sent")
+    parser.add_argument("--map", metavar="MAP", help="the drive is another inverter: a map, or the name of one "
+                        "(docs/mapping.md, ipmsm-can map list); it is only listened to")
+    parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
     parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
     parser.add_argument("--quiet", action="store_true", help="no status while it runs, only the summary")
     parser.add_argument("--no-reconnect", action="store_true", help="end when the bus goes away")
@@ -47,6 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def main(args: argparse.Namespace) -> int:
     """Run the companion until it is told to end; returns the exit code."""
+    if args.map is not None:
+        from ipmsm_can.cli.mapped_run import run_mapped
+
+        return run_mapped(args)
+    if args.node is not None:
+        raise ValueError("--node goes with --map; without a map the drive.toml has wire.node")
     from ipmsm_can.config import load_configs
 
     configs = load_configs(args.configs)

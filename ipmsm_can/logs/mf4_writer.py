@@ -39,7 +39,7 @@ _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64], np.
 class Mf4Writer:
     """Write blocks to a new MF4 file; nothing can be read of it before `close`.
 
-    channel: from 0.  Raises ImportError where there is no asammdf.
+    channel: from 0.  size: bytes so far, before they are packed.  Raises ImportError where there is no asammdf.
     """
 
     def __init__(self, path: Path, channel: int) -> None:
@@ -53,6 +53,7 @@ class Mf4Writer:
         self._start_s: int | None = None
         self._waiting: list[FrameBlock] = []
         self._count = 0
+        self.size = 0
 
     def write(self, block: FrameBlock) -> None:
         """Append the frames of a block."""
@@ -99,6 +100,7 @@ class Mf4Writer:
         return records
 
     def _append(self, name: str, records: NDArray[Any], seconds: NDArray[np.float64]) -> None:
+        self.size += records.nbytes + seconds.nbytes
         if name in self._groups:
             self._file.extend(self._groups[name], [(seconds, None), (records, None)])
             return

@@ -157,6 +157,12 @@ class LogWriter:
             with beside(self.path).open("a", encoding="utf-8") as file:
                 file.write(as_comment(mark))
 
+    @property
+    def size(self) -> int:
+        """Bytes written so far; of an MF4 file, which exists only at the end, those that are to be packed."""
+        own: int | None = getattr(self._writer, "size", None)
+        return self.path.stat().st_size if own is None else own
+
     def flush(self) -> None:
         """Hand over to the operating system what is still buffered, where the format can."""
         self._writer.flush()

@@ -95,13 +95,26 @@ class _Group:
     last: float = 0.0
 
 
+def _is_enumeration(layout: SignalLayout) -> bool:
+    """Its values are words; a quantity may have a word for one of its values, too, and stays a quantity."""
+    return bool(layout.choices) and layout.scale == 1.0 and layout.offset == 0.0 and not layout.unit
+
+
+def _about(layout: SignalLayout) -> str:
+    """Its comment, and what single values of a quantity mean."""
+    if not layout.choices or _is_enumeration(layout):
+        return layout.comment
+    words = ", ".join(f"{value * layout.scale + layout.offset:g}: {text}" for value, text in layout.choices.items())
+    return f"{layout.comment} ({words})".strip()
+
+
 def _stored(layout: SignalLayout) -> tuple[np.dtype[Any], dict[str, Any] | None]:
     """How the raw values of a signal are stored, and how MDF makes physical ones of them."""
     if layout.kind == "float":
         return np.dtype(np.float64), None
     size = next(n for n in (1, 2, 4, 8) if 8 * n >= layout.length)
     kind = np.dtype(f"{'i' if layout.kind == 'signed' else 'u'}{size}")
-    if layout.choices:
+    if _is_enumeration(layout):
         words: dict[str, Any] = {"default": ""}
         for k, (value, text) in enumerate(sorted(layout.choices.items())):
             words |= {f"val_{k}": value, f"text_{k}": text}
@@ -149,7 +162,7 @@ class MeasureFile:
     def _message_group(self, kind: MessageKind, node: int, many: bool) -> _Group:
         codec = self._protocol.codecs[kind]
         return _Group(f"{codec.name} {node}" if many else codec.name, {
-            x.name: (x.unit, x.comment, _stored(x)[1]) for x in codec.layouts})
+            x.name: (x.unit, _about(x), _stored(x)[1]) for x in codec.layouts})
 
     def feed(self, block: FrameBlock, tracked: Sequence[Tracked], sent: FrameBlock | None = None) -> None:
         """Take in frames, received and sent, and what was estimated from them."""

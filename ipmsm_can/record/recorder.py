@@ -136,7 +136,7 @@ class Recorder:
         frames += self._append(waiting)
         self._writer.flush()
         self._frames += frames
-        self._size = self._path.stat().st_size
+        self._size = self._writer.size
         lasted = 0.0 if self._first_ns is None else 1e-9 * (self._last_ns - self._first_ns)
         if self._rotation.due(self._size, lasted):
             self._writer.close()

@@ -6,6 +6,7 @@ A display in a process of its own gets it through a pipe, so nothing here import
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import PurePath
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +36,18 @@ class RecordStatus:
     @property
     def words(self) -> str:
         """"REC run_002.blf 12.3 MB", and what is wrong."""
-        text = f"{'REC' if self.what == 'record' else 'MEASURE'} {self.path} {megabytes(self.size)}"
+        name = PurePath(self.path).name
+        text = f"{'REC' if self.what == 'record' else 'MEASURE'} {name} {megabytes(self.size)}"
         if self.problem:
-            text = f"NOT RECORDING {self.path}: {self.problem}"
+            text = f"NOT RECORDING: {self.problem}"
         return text + (f", {self.refused + self.lost} frames NOT in it" if self.refused or self.lost else "")
 
     @property
     def summary(self) -> str:
         """What was recorded, when all is over."""
         where = self.path if self.files <= 1 else f"{self.files} files, the last {self.path}"
-        text = f"recorded {self.frames} frames in {where}, {megabytes(self.size)}"
+        verb = "recorded" if self.what == "record" else "measured"
+        text = f"{verb} {self.frames} frames in {where}, {megabytes(self.size)}"
         if self.refused:
             text += f"; {self.refused} frames are not in it: writing was slower than the bus"
         if self.problem:

@@ -34,7 +34,7 @@ from ipmsm_can.wire.protocol import Protocol
 from tests.vcan.test_reconnect import Sender, ip, traffic, vcan7  # noqa: F401
 
 PROGRAM = [sys.executable, "-m", "ipmsm_can"]
-FILLER = 0x3FF
+FILLER = 0x5FF
 SECONDS = float(os.environ.get("IPMSM_CAN_SECONDS", "6"))
 
 
@@ -58,7 +58,7 @@ def full_bus(seconds: float, fd: bool, load: float) -> FrameBlock:
     node = DriveNode(Protocol(), 0, simulation, DriveNodeSettings(fd=fd, reference_rate=200.0))
     drive = node.step(int(simulation.parameters.sample_rate * seconds)).frames
 
-    def lasts(block: FrameBlock) -> np.ndarray:  # type: ignore[type-arg]
+    def lasts(block: FrameBlock) -> np.ndarray:
         nominal, data = frame_bits(block)
         return nominal / 1e6 + data / 5e6
 
@@ -132,6 +132,17 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
+def caught_up(log: Path) -> None:
+    """Wait until no more of our frames come into a recording: on one slow processor the program may lag behind by
+    what waits in the kernel."""
+    count, since = -1, time.monotonic()
+    while time.monotonic() < since + 3.0:
+        found = sum(int(np.count_nonzero(b.can_id == FILLER)) for b in read_log(log))
+        if found != count:
+            count, since = found, time.monotonic()
+        time.sleep(0.5)
+
+
 def told(pattern: str, text: str) -> int:
     match = re.search(pattern, text)
     assert match, text[-3000:]
@@ -143,23 +154,25 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / float(os.sysconf("SC_CLK_TCK"))
 
 
-@pytest.mark.parametrize(("fd", "load", "suffix"), [(False, 1.0, ".blf"), (False, 1.0, ".log"), (True, 0.6, ".blf")])
+@pytest.mark.parametrize(("fd", "load", "suffix", "answer"), [
+    (False, 1.0, ".blf", False), (False, 1.0, ".log", True), (True, 0.6, ".blf", True)])
 def test_no_frame_is_lost_that_the_kernel_delivered(config: Path, tmp_path: Path, fd: bool, load: float,
-                                                    suffix: str) -> None:
-    """Classical at 1 Mbit/s saturated, FD at 60 %; the companion answers, its screen is on, and it records."""
+                                                    suffix: str, answer: bool) -> None:
+    """Classical at 1 Mbit/s saturated, FD at 60 %; the companion's screen is on, it records, and answers or not."""
     frames = full_bus(SECONDS, fd, load)
     log = tmp_path / f"run{suffix}"
-    with on_a_terminal("run", str(config), "-i", "socketcan", "-c", "vcan0", "--transmit", "--record",
-                       str(log)) as (process, drawn):
+    with on_a_terminal("run", str(config), "-i", "socketcan", "-c", "vcan0", "--record", str(log),
+                       *(["--transmit"] if answer else []),
+                       *(["--measure", str(tmp_path / "run.mf4")] if fd else [])) as (process, drawn):
         until(drawn, b"REC ")
         used = cpu_s(process.pid)
         took = play(frames)
         used = cpu_s(process.pid) - used
-        time.sleep(1.0)
+        caught_up(log)
         process.send_signal(signal.SIGINT)
         process.wait(60)
     text = drawn.decode(errors="replace")
-    drops = told(r"kernel drops (\d+)", text.rsplit("TRANSMITTING for", 1)[1])
+    drops = told(r"kernel drops (\d+)", text[text.rindex(" frames received, "):])
     received = told(r"(\d+) frames received", text)
     answers = told(r"frames received, (\d+) sent", text)
     recorded = told(r"recorded (\d+) frames in", text)
@@ -177,6 +190,12 @@ def test_no_frame_is_lost_that_the_kernel_delivered(config: Path, tmp_path: Path
         found = np.concatenate([found[back.can_id[~ours] != FILLER], found[back.can_id[~ours] == FILLER]])
         assert np.array_equal(found, expected), "every frame, in order, to the last bit"
     assert process.returncode == 0
+    if fd:
+        from asammdf import MDF
+
+        with MDF(tmp_path / "run.mf4") as file:
+            filled = file.get("filled", group=0).samples
+            assert len(filled) >= 0.99 * 10_000 * SECONDS and (drops or not filled.any())
 
 
 def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> None:
@@ -192,7 +211,7 @@ def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> No
         time.sleep(0.5)
         frames = full_bus(1.0, False, 0.9)
         play(frames)
-        time.sleep(1.0)
+        caught_up(log)
         process.send_signal(signal.SIGINT)
         process.wait(60)
     text = drawn.decode(errors="replace")
@@ -207,7 +226,7 @@ def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> No
 def test_twenty_outages_during_a_recording(vcan7: str, tmp_path: Path) -> None:  # noqa: F811
     """Down and up, or away and made anew: complete but for the gaps, and every gap is marked."""
     log = tmp_path / "run.blf"
-    sender = Sender(traffic(240.0))
+    sender = Sender(traffic(120.0))
     process = subprocess.Popen([*PROGRAM, "record", str(log), "-i", "socketcan", "-c", vcan7],
                                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                                env={**os.environ, "PYTHONUNBUFFERED": "1"})
@@ -219,7 +238,9 @@ def test_twenty_outages_during_a_recording(vcan7: str, tmp_path: Path) -> None: 
         lines.extend(process.stdout)
 
     try:
-        lines.append(process.stdout.readline())
+        while not lines or " REC " not in lines[-1]:  # kernels may have to be compiled first
+            lines.append(process.stdout.readline())
+            assert lines[-1], "".join(lines)
         thread = threading.Thread(target=read)
         thread.start()
         sender.thread.start()
