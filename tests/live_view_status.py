@@ -30,4 +30,4 @@ FINDINGS = (
 EVENTS = (Event("14:03:10", "recording to run.blf"), Event("14:03:11", "mark 1"), Event("14:03:12", "mark 2"))
 STATUS = MonitorStatus(
     run=RunStatus("ipmsm-can monitor", 83.0, False, BUS, (NODE,)), drives=(DRIVE,), source=BUS.description,
-    recording="run.blf 12.3 MB", checked="the bus's health", findings=FINDINGS, events=EVENTS)
+    recording="run.blf 12.3 MB", checked="the bus, drive 3", findings=FINDINGS, events=EVENTS)

@@ -6,7 +6,8 @@ import math
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from ipmsm_can.bus import live
+from ipmsm_can.bus.health import BusHealth
 from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.playback import LogPort
 from ipmsm_can.bus.simulated import SimulatedPort
@@ -26,6 +28,7 @@ from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view import chart
 from ipmsm_can.live_view.control import Controls
 from ipmsm_can.live_view.course import CourseRing
+from ipmsm_can.live_view.judging import Batch, Judge, Plan
 from ipmsm_can.live_view.keys import TAB, decode
 from ipmsm_can.live_view.picture import picture
 from ipmsm_can.live_view.status import FINDINGS, HELP, MonitorStatus, Told
@@ -119,7 +122,10 @@ def test_what_is_grave_is_told_in_words() -> None:
     assert " NOT RECORDING " in shown(full)[0] and "no space left" in shown(full)[1]
     assert " PAUSED " in shown(replace(STATUS, paused=True))[0]
     assert shown(replace(STATUS, keys=False))[-1].startswith("no keys: standard input is not a terminal")
-    assert "none so far  looked for: the bus's health" in "\n".join(shown(replace(STATUS, findings=())))
+    for checked, words in (("the bus, drive 3", "none so far  looked at: the bus, drive 3"),
+                           ("starting", "the checks are starting"), ("", "nobody looks for any")):
+        for page in ("main", FINDINGS):
+            assert words in "\n".join(shown(replace(STATUS, findings=(), checked=checked, page=page)))
 
 
 def test_findings_have_a_page_with_advice() -> None:
@@ -278,7 +284,7 @@ class Stage:
         self.passed = 0.0
         self.controls = Controls(self.companion, None, self._quit, self.clock.now_ns, self.clock.words,
                                  threading.Event(), lambda: self.passed)
-        self.watch = Watch({}, lambda: "now")
+        self.watch = Watch(None, lambda: "now")
         self.view = LiveView(self.runner, self.controls, self.watch, self.clock)
         self.answers: list[FrameBlock] = []
 
@@ -481,69 +487,90 @@ def test_one_drive_after_the_other() -> None:
 # Findings
 
 
-@dataclass
-class Complaint:
-    severity: str
-    sentence: str
-    advice: str = ""
-
-
 class Grumbler:
     """A source that says what it is told to."""
 
     def __init__(self) -> None:
         self.fed = 0
-        self.says: list[Complaint] = []
+        self.says: list[Told] = []
         self.fails = False
 
-    def feed(self, block: FrameBlock) -> None:
-        self.fed += len(block)
+    def feed(self, batch: Batch) -> None:
+        self.fed += len(batch.block)
 
-    def findings(self) -> list[Complaint]:
+    def findings(self) -> list[Told]:
         if self.fails:
             raise RuntimeError("out of order")
         return self.says
 
 
-def test_findings_come_once_gravest_first_and_a_broken_check_ends_alone() -> None:
+def test_the_gravest_comes_first_and_a_broken_check_ends_alone() -> None:
     one, other = Grumbler(), Grumbler()
-    stamps = iter(f"t{k}" for k in range(100))
-    news: list[Told] = []
-    watch = Watch({"one": one, "the other": other}, lambda: next(stamps), news.append)
-    watch.offer(FrameBlock.zeros(5))
-    watch.offer(FrameBlock.zeros(3))
-    watch.take()
-    assert one.fed == other.fed == 8
-    one.says = [Complaint("notice", "Load is 31.2 %."), Complaint("error", "Broken.", "Mend it.")]
-    other.says = [Complaint("info", "Fine.")]
-    watch.judge()
-    assert [(f.severity, f.sentence, f.since) for f in watch.findings] == [
-        ("error", "Broken.", "t0"), ("notice", "Load is 31.2 %.", "t1"), ("notice", "Fine.", "t2")]
-    one.says[0].sentence = "Load is 32.9 %."
+    judge = Judge({"one": one, "the other": other})
+    judge.feed(Batch(FrameBlock.zeros(8)))
+    one.says = [Told("notice", "Load is 31.2 %."), Told("error", "Broken.", "Mend it.")]
+    other.says = [Told("error", "Burnt.")]
+    assert [f.sentence for f in judge.findings()] == ["Broken.", "Burnt.", "Load is 31.2 %."]
     other.fails = True
-    watch.judge()
-    assert [f.sentence for f in watch.findings] == [
-        "Broken.", "The check of the other failed and was ended: RuntimeError: out of order", "Load is 32.9 %."]
-    assert watch.findings[2].since == "t1"
-    assert [told.sentence for told in news][3:] == [watch.findings[1].sentence], "a changed number is no news"
-    watch.offer(FrameBlock.zeros(2))
-    watch.take()
+    assert [f.sentence for f in judge.findings()] == [
+        "Broken.", "The check of the other failed and was ended: RuntimeError: out of order", "Load is 31.2 %."]
+    judge.feed(Batch(FrameBlock.zeros(2)))
     assert (one.fed, other.fed) == (10, 8)
 
 
-def test_frames_that_cannot_be_checked_in_time_are_left_out_and_that_is_said() -> None:
-    source = Grumbler()
-    watch = Watch({"one": source}, lambda: "")
+def test_a_finding_is_news_once_and_keeps_its_time() -> None:
+    stamps = iter(f"t{k}" for k in range(100))
+    news: list[Told] = []
+    watch = Watch(None, lambda: next(stamps), news.append)
+    watch.accept((Told("error", "Broken.", "Mend it."), Told("notice", "Load is 31.2 %.")))
+    watch.accept((Told("notice", "Load is 32.9 %."), Told("notice", "Other.")))
+    assert [(f.sentence, f.since) for f in watch.findings] == [("Load is 32.9 %.", "t1"), ("Other.", "t3")]
+    assert [told.sentence for told in news] == ["Broken.", "Load is 31.2 %.", "Other."], "a new number is no news"
+
+
+def test_frames_that_cannot_be_judged_in_time_are_left_out_and_that_is_said() -> None:
+    watch = Watch(None, lambda: "")
     half = FrameBlock.zeros(MOST_FRAMES // 2)
+    watch.offer(half)
+    assert not len(watch.take()), "before anybody judges, nothing is kept"
+    watch.begin(("the bus",))
     for _ in range(3):
         watch.offer(half)
-    watch.take()
-    watch.judge()
-    assert source.fed == MOST_FRAMES
+    assert len(watch.take()) == MOST_FRAMES
+    watch.accept(())
     assert f"{MOST_FRAMES // 2} frames were left out" in watch.findings[0].sentence
     watch.offer(half)
-    watch.take()
-    assert source.fed == MOST_FRAMES * 3 // 2
+    assert len(watch.take()) == MOST_FRAMES // 2
+
+
+def test_the_process_judges_bus_and_drive() -> None:
+    """What BusHealth says of the same frames is what comes back; and a process that dies is told of."""
+    config = config_from({"motor": {"preset": "m2"}})
+    plan = Plan((config,), (1_000_000, 5_000_000), True)
+    frames = samples(5_000)
+    frames = frames.take(np.arange(len(frames)) % 97 != 3)  # samples are missing
+    watch = Watch(plan, lambda: "now", note=lambda block: Batch(block, drops=17))
+    with watch:
+        until(lambda: watch.checked == "the bus, drive 0")
+        watch.offer(frames)
+        until(lambda: bool(watch.findings))
+        told = " ".join(f.sentence for f in watch.findings)
+        health = BusHealth(1e6, 5e6, protocol=PROTOCOL)
+        health.note_port(17)
+        health.update(frames)
+        expected = [f.sentence for f in health.report().findings]
+        assert len(expected) >= 2 and all(sentence in told for sentence in expected)
+        assert watch._process is not None
+        watch._process.kill()
+        until(lambda: watch.checked == "nothing any more")
+        assert "has ended" in watch.findings[0].sentence
+
+
+def until(happens: Callable[[], bool], seconds: float = 120.0) -> None:
+    end = time.monotonic() + seconds
+    while not happens():
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.02)
 
 
 # Where the frames come from

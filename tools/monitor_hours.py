@@ -4,7 +4,7 @@
 
 A second of a simulated drive's frames and of the companion's estimates is handed to the live view again and again,
 with the time moved on: in rounds of a tenth of a second, five statuses a second made and packed as for the drawing
-process, the findings' thread played by hand.
+process, the findings' thread and process played by hand.
 """
 
 from __future__ import annotations
@@ -20,10 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ipmsm_can.bus.health import BusHealth
 from ipmsm_can.bus.live import LiveRunner
 from ipmsm_can.bus.simulated import SimulatedPort
-from ipmsm_can.cli.live_view import BusSource
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
@@ -31,6 +29,7 @@ from ipmsm_can.drive.profile import RPM, constant
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view.control import Controls
+from ipmsm_can.live_view.judging import Batch, BusSource, Judge, Plan
 from ipmsm_can.live_view.taking import FrameClock, LiveView
 from ipmsm_can.live_view.watch import Watch
 from ipmsm_can.motor import M2
@@ -78,9 +77,9 @@ def run(hours: float, warm_up_hours: float, thorough: bool = True) -> Growth:
     runner = LiveRunner(SimulatedPort([drive], "virtual time"), companion, 1e6, 5e6)
     clock = FrameClock(of_day=True)
     controls = Controls(companion, None, lambda: None, clock.now_ns, clock.words, threading.Event())
-    source = BusSource(BusHealth(1e6, 5e6, protocol=protocol))
-    watch = Watch({"the bus's health": source} if thorough else {}, lambda: clock.words(clock.now_ns()),
-                  controls.note_finding)
+    judge = Judge({"the bus": BusSource(Plan((config,), (1_000_000, 5_000_000), True))} if thorough else {})
+    watch = Watch(None, lambda: clock.words(clock.now_ns()), controls.note_finding)
+    watch.begin(("the bus",))
     view = LiveView(runner, controls, watch, clock)
 
     def second(k: int) -> None:
@@ -92,9 +91,9 @@ def run(hours: float, warm_up_hours: float, thorough: bool = True) -> Growth:
             if (n % 2 if thorough else n == 0):
                 pickle.dumps(view.status())
             if n % 5 == 4:
-                watch.take()
+                judge.feed(Batch(watch.take()))
         if k % 2:
-            watch.judge()
+            watch.accept(judge.findings())
         controls.press("m")
 
     warm = round(3600 * warm_up_hours)

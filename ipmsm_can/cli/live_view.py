@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,18 +17,16 @@ from typing import TYPE_CHECKING
 from ipmsm_can.cli import bus, recording
 
 if TYPE_CHECKING:
-    from ipmsm_can.bus.health import BusHealth
-    from ipmsm_can.bus.health_report import Finding
     from ipmsm_can.bus.link import Link
     from ipmsm_can.bus.live import LiveRunner
     from ipmsm_can.bus.port import Port
     from ipmsm_can.config import DriveConfig
     from ipmsm_can.drive.profile import Profile
     from ipmsm_can.frames import FrameBlock
+    from ipmsm_can.live_view.judging import Batch, Plan
     from ipmsm_can.live_view.recording import KeyRecording
     from ipmsm_can.live_view.status import MonitorStatus
     from ipmsm_can.live_view.taking import LiveView
-    from ipmsm_can.live_view.watch import Source
     from ipmsm_can.record.tap import Tap
     from ipmsm_can.wire.protocol import Protocol
 
@@ -73,6 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         "--fd it samples at 10 kHz")
     parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
     recording.add_arguments(parser)
+    parser.add_argument("--no-findings", action="store_true",
+                        help="do not judge bus and drive meanwhile (saves a process, and about a tenth of a core)")
     parser.add_argument("--ascii", action="store_true", help="draw with plain characters")
     parser.add_argument("--no-reconnect", action="store_true", help="end when the bus goes away")
     bus.add_arguments(parser)
@@ -112,7 +112,6 @@ def main(args: argparse.Namespace) -> int:
     with bus.patience():
         warm_up_companion(configs, protocol)
         warm_up()
-        sources = _sources(args, configs, protocol, rates)
     configs, open_port, source = _opener(args, configs, protocol)
     with (_stop(args.duration) as stop, _short_turns(), open_port() as port, Link(port, open_port) as link,
           _recording(args, link, configs, protocol) as (record, tap)):
@@ -122,7 +121,8 @@ def main(args: argparse.Namespace) -> int:
         controls = Controls(runner.companion, record, lambda: stop.now("q"), clock.now_ns, clock.words, news)
         if args.record:
             controls.toggle_record()
-        watch = Watch(sources, lambda: clock.words(clock.now_ns()), controls.note_finding)
+        watch = Watch(_plan(args, configs, rates), lambda: clock.words(clock.now_ns()), controls.note_finding,
+                      _notes(link))
         view = LiveView(runner, controls, watch, clock, source, tap.status)
         view.ascii = args.ascii or not _is_utf8()
         code, last = _serve(runner, view, news, lambda: stop() or getattr(link.port, "finished", False))
@@ -193,29 +193,23 @@ def _demo_profile() -> Profile:
                    tuple((t0 + t, v) for t0 in starts for t, v in once.load), once.duration * _DEMO_ROUNDS, "demo")
 
 
-def _sources(args: argparse.Namespace, configs: tuple[DriveConfig, ...], protocol: Protocol,
-             rates: tuple[int, int]) -> dict[str, Source]:
-    """What makes findings, by what it looks for."""
-    from ipmsm_can.bus import health
+def _plan(args: argparse.Namespace, configs: tuple[DriveConfig, ...], rates: tuple[int, int]) -> Plan | None:
+    """What is to be judged."""
+    from ipmsm_can.live_view.judging import Plan
 
-    health.warm_up(protocol)
-    error_classes = args.log is None or ".log" in Path(args.log).suffixes
-    return {"the bus's health": BusSource(health.BusHealth(*rates, protocol=protocol, error_classes=error_classes))}
+    if args.no_findings:
+        return None
+    return Plan(configs, rates, error_classes=args.log is None or ".log" in Path(args.log).suffixes)
 
 
-class BusSource:
-    """A `BusHealth` as a source of findings; its silence is what the screen shows anyway."""
+def _notes(link: Link) -> Callable[[FrameBlock], Batch]:
+    """Frames with what the port knows beside them."""
+    from ipmsm_can.bus.socketcan import SocketCanPort
+    from ipmsm_can.live_view.judging import Batch
 
-    def __init__(self, health: BusHealth) -> None:
-        self._health = health
-
-    def feed(self, block: FrameBlock) -> None:
-        """Take in frames."""
-        self._health.update(block)
-
-    def findings(self) -> Sequence[Finding]:
-        """As of now."""
-        return self._health.report().findings
+    counts_drops = isinstance(link.port, SocketCanPort)
+    return lambda block: Batch(block, link.drops if counts_drops else -1, link.outages, link.outage_time,
+                               link.words)
 
 
 @contextmanager

@@ -59,7 +59,7 @@ class Screen(Generic[S]):
     def __enter__(self) -> Self:
         if self._live:
             self._child = subprocess.Popen([sys.executable, "-m", self._drawer],
-                                           stdin=subprocess.PIPE, env=_environment())
+                                           stdin=subprocess.PIPE, env=environment())
         self._thread.start()
         return self
 
@@ -100,8 +100,8 @@ class Screen(Generic[S]):
                 return
 
 
-def _environment() -> dict[str, str]:
-    """Ours, with the package's home in the path: the program may have been started in another folder."""
+def environment() -> dict[str, str]:
+    """For a process of ours, with the package's home in the path: this one may have been started in any folder."""
     home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
     path = os.environ.get("PYTHONPATH")
     return {**os.environ, "PYTHONPATH": f"{home}{os.pathsep}{path}" if path else home}

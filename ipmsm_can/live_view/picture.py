@@ -281,9 +281,16 @@ def _finding(told: Told, width: int, advice: bool) -> list[Text]:
     return lines + [Text(" " * indent + part) for part in parts[1:]]
 
 
+def _none(status: MonitorStatus) -> tuple[str, tuple[str, str]]:
+    """Where there is no finding: because nothing is wrong, or because nobody looks (yet)."""
+    if status.checked in ("", "starting"):
+        return "nobody looks for any" if not status.checked else "the checks are starting", ("", "")
+    return "none so far", (f"  looked at: {status.checked}", _DIM)
+
+
 def _findings(status: MonitorStatus, width: int, room: int) -> list[Text]:
     if not status.findings:
-        return [_labelled("findings", "none so far", (f"  looked for: {status.checked}", _DIM))]
+        return [_labelled("findings", *_none(status))]
     lines: list[Text] = []
     for k, told in enumerate(status.findings):
         parts = _finding(told, width, False)
@@ -308,7 +315,7 @@ def _events(status: MonitorStatus, room: int) -> list[Text]:
 
 
 def _all_findings(status: MonitorStatus, width: int, room: int) -> list[Text]:
-    lines = [Text("findings" if status.findings else f"no findings; looked for: {status.checked}", style="bold")]
+    lines = [Text("findings", style="bold") if status.findings else _labelled("findings", *_none(status))]
     for told in status.findings:
         lines += _finding(replace(told, advice=f"{told.advice} (since {told.since})"), width, True)
     lines += [Text(), Text("events" if status.events else "no events", style="bold")]

@@ -1,143 +1,148 @@
-"""Findings as they come: the bus's health and the drive's diagnosis, beside the receiving thread.
+"""Findings as they come, without holding the receiving thread up: another process makes them (`judging`).
 
-The receiving thread only puts blocks into a queue that cannot grow; a thread of this module takes them out twice
-a second.  Where it cannot keep up, frames are left out of the findings, never out of the estimate or the record,
-and a finding says so.
+The receiving thread only puts blocks into a queue that cannot grow; a thread takes them out twice a second and
+hands them to that process.  Where it cannot keep up, frames are left out of the findings, never out of the estimate
+or the record, and a finding says so.
 """
 
 from __future__ import annotations
 
+import contextlib
+import pickle
 import re
+import subprocess
+import sys
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import IO, Self
 
+from ipmsm_can.cli.screen import environment
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.live_view.judging import Batch, Plan
 from ipmsm_can.live_view.status import SEVERITIES, Told
 
 TAKE_S = 0.5
-JUDGE_S = 2.0
 MOST_FRAMES = 1 << 17
 """Frames that may wait: about ten seconds of a full bus."""
 _NUMBER = re.compile(r"[\d.]+")
-
-
-class Source(Protocol):
-    """Something that makes findings of frames; `feed` and `findings` are called from one thread."""
-
-    def feed(self, block: FrameBlock) -> object:
-        """Take in frames; memory must not grow."""
-
-    def findings(self) -> Sequence[Any]:
-        """What is the matter as of now: objects with `severity` (SEVERITIES, or "info"), `sentence`, `advice`."""
+_KEYS_KEPT = 1000
+_PATIENCE_S = 1.0
 
 
 class Watch:
-    """Feeds sources from a thread while the `with` block lasts.
+    """Has the frames judged while the `with` block lasts.
 
-    sources: by what they look for, in words.  stamp: the time, in words, for a finding that is new.  tell: called
-    from that thread with each new finding.
+    plan: what is judged; None: nothing is.  stamp: the time, in words, for a finding that is new.  tell: called
+    with each new finding.  note: puts what the port knows beside frames.
     findings: the present ones, gravest first; a new tuple each time.
     """
 
-    def __init__(self, sources: dict[str, Source], stamp: Callable[[], str],
-                 tell: Callable[[Told], None] = lambda told: None) -> None:
+    def __init__(self, plan: Plan | None, stamp: Callable[[], str],
+                 tell: Callable[[Told], None] = lambda told: None,
+                 note: Callable[[FrameBlock], Batch] = Batch) -> None:
         self.findings: tuple[Told, ...] = ()
+        self.checked = "" if plan is None else "starting"
+        """What is looked at, in words; "starting" until the process is there, "" for nothing."""
         self.skipped = 0
-        self._sources = sources
+        self._plan = plan
         self._stamp = stamp
         self._tell = tell
+        self._note = note
         self._queue: deque[FrameBlock] = deque()
-        self._waiting = 0
-        self._taken = 0
-        self._broken: dict[str, str] = {}
+        self._offered = self._taken = 0
+        self._ready = False
         self._since: dict[str, str] = {}
         self._end = threading.Event()
-        self._thread = threading.Thread(target=self._work, name="findings", daemon=True)
-
-    @property
-    def checked(self) -> str:
-        """What is looked for, in words."""
-        return ", ".join(self._sources)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._threads: list[threading.Thread] = []
 
     def offer(self, block: FrameBlock) -> None:
         """Take in a block, or leave it out; the receiving thread's."""
         n = len(block)
-        if not n:
+        if not n or not self._ready:
             return
-        if self._waiting - self._taken + n > MOST_FRAMES:
+        if self._offered - self._taken + n > MOST_FRAMES:
             self.skipped += n
             return
-        self._waiting += n
+        self._offered += n
         self._queue.append(block)
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
-                 trace: TracebackType | None) -> None:
-        self._end.set()
-        self._thread.join(5.0)
-
-    def _work(self) -> None:
-        rounds = round(JUDGE_S / TAKE_S)
-        k = 0
-        while not self._end.wait(TAKE_S):
-            self.take()
-            k += 1
-            if k % rounds == 0 or not self.findings:
-                self.judge()
-
-    def take(self) -> None:
-        """Hand over what waits."""
+    def take(self) -> FrameBlock:
+        """Everything that waits."""
         blocks = []
         while self._queue:
             blocks.append(self._queue.popleft())
-        if not blocks:
-            return
         block = FrameBlock.concat(blocks)
         self._taken += len(block)
-        for name, source in self._sources.items():
-            if name not in self._broken:
-                self._guard(name, partial(source.feed, block))
+        return block
 
-    def judge(self) -> None:
-        """Make the findings anew; what is new since the last time is told."""
-        found: list[Told] = []
-        for name, source in self._sources.items():
-            if name not in self._broken:
-                found += [_told(one) for one in self._guard(name, source.findings) or ()]
-        found += [Told("warning", words) for words in self._broken.values()]
+    def accept(self, found: tuple[Told, ...]) -> None:
+        """The findings as of now: each keeps the time it was first seen at, and is told once."""
         if self.skipped:
-            found.append(Told("warning", f"This computer is too slow for all checks: {self.skipped} frames were "
-                                         "left out of the findings (the estimate and the record have them)."))
-        found.sort(key=lambda told: SEVERITIES.index(told.severity))
+            slow = (f"This computer is too slow for all checks: {self.skipped} frames were left out of the "
+                    "findings (the estimate and the record have them).")
+            found = tuple(sorted([*found, Told("warning", slow)], key=lambda told: SEVERITIES.index(told.severity)))
+        if len(self._since) > _KEYS_KEPT:
+            self._since.clear()
         marked = []
         for told in found:
             key = told.severity + _NUMBER.sub("#", told.sentence)  # a number that changes is no news
             new = key not in self._since
             since = self._since.setdefault(key, self._stamp())
-            told = Told(told.severity, told.sentence, told.advice, since)
-            marked.append(told)
+            marked.append(Told(told.severity, told.sentence, told.advice, since))
             if new:
-                self._tell(told)
-        if len(self._since) > 1000:
-            self._since.clear()
+                self._tell(marked[-1])
         self.findings = tuple(marked)
 
-    def _guard(self, name: str, call: Callable[[], Any]) -> Any:
-        """A check that fails ends alone, with a sentence in its place."""
-        try:
-            return call()
-        except Exception as error:
-            self._broken[name] = f"The check of {name} failed and was ended: {type(error).__name__}: {error}"
-            return None
+    def begin(self, looked_at: tuple[str, ...]) -> None:
+        """The frames from now on are judged."""
+        self.checked, self._ready = ", ".join(looked_at), True
 
+    # The process
 
-def _told(finding: Any) -> Told:
-    severity = finding.severity if finding.severity in SEVERITIES else "notice"
-    return Told(severity, finding.sentence, getattr(finding, "advice", "") or "")
+    def __enter__(self) -> Self:
+        if self._plan is None:
+            return self
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "ipmsm_can.live_view.judging"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, env=environment())
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._threads = [
+            threading.Thread(target=self._write, args=(self._process.stdin,), name="frames to judge", daemon=True),
+            threading.Thread(target=self._read, args=(self._process.stdout,), name="findings", daemon=True)]
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        self._end.set()
+        process = self._process
+        if process is None:
+            return
+        # it may be busy, and nobody waits for what it would say
+        process.kill()
+        process.wait()
+        for thread in self._threads:
+            thread.join(_PATIENCE_S)
+
+    def _write(self, pipe: IO[bytes]) -> None:
+        with contextlib.suppress(OSError, ValueError):
+            pipe.write(pickle.dumps(self._plan))
+            pipe.flush()
+            while not self._end.wait(TAKE_S):
+                if self._ready:
+                    pipe.write(pickle.dumps(self._note(self.take())))
+                    pipe.flush()
+
+    def _read(self, pipe: IO[bytes]) -> None:
+        with contextlib.suppress(EOFError, pickle.UnpicklingError, OSError, ValueError):
+            self.begin(pickle.load(pipe))
+            while True:
+                self.accept(pickle.load(pipe))
+        if not self._end.is_set():
+            self._ready = False
+            self.checked = "nothing any more"
+            self.accept((Told("warning", "The process that looks for findings has ended, so there are no more."),))
