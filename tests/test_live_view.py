@@ -128,6 +128,12 @@ def test_what_is_grave_is_told_in_words() -> None:
             assert words in "\n".join(shown(replace(STATUS, findings=(), checked=checked, page=page)))
 
 
+def test_what_others_say_is_put_into_ascii_where_there_is_no_more() -> None:
+    told = (Told("error", "The coil has 3 Ω ± 1, at 20 °C, says Jürgen."),)
+    text = "\n".join(shown(replace(STATUS, ascii=True, findings=told)))
+    assert text.isascii() and "3 ohm +/- 1, at 20  degC, says J?rgen." in text
+
+
 def test_findings_have_a_page_with_advice() -> None:
     few = "\n".join(shown(STATUS))
     assert "(+" in few and "more: f)" in few and "Send less" not in few

@@ -115,6 +115,20 @@ def test_a_program_that_is_killed_leaves_the_terminal_as_it_was() -> None:
         assert t.mode == t.before
 
 
+def test_a_connection_that_hangs_up_ends_in_order(tmp_path: Path) -> None:
+    """Without a keyboard, too; the record is finished."""
+    log = tmp_path / "run.blf"
+    with open(os.devnull) as nothing, Terminal(
+            [*MONITOR, "--demo", "--no-findings", "--record", str(log)], stdin=nothing.fileno()) as t:
+        t.wait("no keys: standard input is not a terminal")
+        t.wait("[x] locked")
+        assert "nobody looks for any" in t.text
+        os.kill(t.pid, signal.SIGHUP)
+        assert t.finish() == 0
+    reader = read_log(log)
+    assert sum(map(len, reader)) > 1000 and not reader.problem
+
+
 def test_without_a_terminal_there_are_lines(capfd: pytest.CaptureFixture[str]) -> None:
     told = subprocess.run([*MONITOR, "--demo", "--duration", "1.3"], capture_output=True, text=True, timeout=120,
                           stdin=subprocess.DEVNULL, check=False)

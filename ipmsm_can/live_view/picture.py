@@ -21,6 +21,7 @@ _STYLES = {"error": _BAD, "warning": "bold yellow", "notice": "cyan"}
 _LABEL = 12
 _NARROW, _WIDE = 72, 110
 _CHART_LEAST, _CHART_MOST = 3, 12
+_PLAIN = str.maketrans({"°": " deg", "±": "+/-", "Ω": "ohm", "µ": "u", "²": "^2", "–": "-", "…": "..."})
 _HELP = (
     ("r", "start or stop recording every frame (second line: the file)"),
     ("m", "mark this moment: in the record, and in the list of events"),
@@ -61,6 +62,8 @@ def picture(status: MonitorStatus, width: int, height: int) -> list[Text]:
     # where not even header and footer fit, what must never be missing goes last
     lines = [*lines[:max(1, height - 1)], *lines[-1:]][:height]
     for line in lines:
+        if status.ascii and not line.plain.isascii():  # a path, or a sentence of the diagnosis
+            line.plain = line.plain.translate(_PLAIN).encode("ascii", "replace").decode()
         line.truncate(width)
     return lines
 
