@@ -134,6 +134,13 @@ def test_what_others_say_is_put_into_ascii_where_there_is_no_more() -> None:
     assert text.isascii() and "3 ohm +/- 1, at 20  degC, says J?rgen." in text
 
 
+def test_lines_for_pipes_tell_the_gravest_finding() -> None:
+    from ipmsm_can.cli.live_view import _line
+
+    assert _line(STATUS).endswith("lost 7 bad 8 | error: The frames take 97 % of the bus time, so others wait.")
+    assert _line(replace(STATUS, findings=STATUS.findings[2:])).endswith("lost 7 bad 8")
+
+
 def test_findings_have_a_page_with_advice() -> None:
     few = "\n".join(shown(STATUS))
     assert "(+" in few and "more: f)" in few and "Send less" not in few

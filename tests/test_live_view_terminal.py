@@ -12,8 +12,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from ipmsm_can.logs import read_log
 from ipmsm_can.logs.writer import write_log
 from ipmsm_can.wire.protocol import Protocol
@@ -83,7 +81,7 @@ def test_a_recording_without_colours_and_without_unicode(tmp_path: Path) -> None
     log, config = tmp_path / "run.blf", tmp_path / "drive.toml"
     config.write_text('[motor]\npreset = "m2"\n')
     write_log(log, [drive_frames(Protocol(), 9.0)])
-    with Terminal([*MONITOR, str(config), "--log", str(log), "--speed", "3"],
+    with Terminal([*MONITOR, str(config), "--log", str(log), "--speed", "3", "--no-findings"],
                   env={"NO_COLOR": "1", "LANG": "C"}) as t:
         text = t.wait("[x] valid")
         assert text.startswith(" SILENT (listening only)  not recording")
@@ -103,7 +101,7 @@ def test_a_recording_without_colours_and_without_unicode(tmp_path: Path) -> None
 
 
 def test_a_program_that_is_killed_leaves_the_terminal_as_it_was() -> None:
-    with Terminal([*MONITOR, "--demo"]) as t:
+    with Terminal([*MONITOR, "--demo", "--no-findings"]) as t:
         t.wait("drive 0  m2")
         os.kill(t.pid, signal.SIGKILL)
         t.finish()
@@ -118,7 +116,7 @@ def test_a_program_that_is_killed_leaves_the_terminal_as_it_was() -> None:
 def test_a_connection_that_hangs_up_ends_in_order(tmp_path: Path) -> None:
     """Without a keyboard, too; the record is finished."""
     log = tmp_path / "run.blf"
-    with open(os.devnull) as nothing, Terminal(
+    with Path(os.devnull).open() as nothing, Terminal(
             [*MONITOR, "--demo", "--no-findings", "--record", str(log)], stdin=nothing.fileno()) as t:
         t.wait("no keys: standard input is not a terminal")
         t.wait("[x] locked")
@@ -129,9 +127,9 @@ def test_a_connection_that_hangs_up_ends_in_order(tmp_path: Path) -> None:
     assert sum(map(len, reader)) > 1000 and not reader.problem
 
 
-def test_without_a_terminal_there_are_lines(capfd: pytest.CaptureFixture[str]) -> None:
-    told = subprocess.run([*MONITOR, "--demo", "--duration", "1.3"], capture_output=True, text=True, timeout=120,
-                          stdin=subprocess.DEVNULL, check=False)
+def test_without_a_terminal_there_are_lines() -> None:
+    told = subprocess.run([*MONITOR, "--demo", "--no-findings", "--duration", "1.3"], capture_output=True,
+                          text=True, timeout=120, stdin=subprocess.DEVNULL, check=False)
     assert told.returncode == 0
     assert re.match(r"0:00:01 SILENT \(listening only\) load .* frames/s", told.stdout)
     assert "\x1b" not in told.stdout

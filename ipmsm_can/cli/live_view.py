@@ -247,8 +247,7 @@ def _serve(runner: LiveRunner, view: LiveView, news: threading.Event,
     gone: BusError | None = None
     keys = Keys(view.controls.press)
     keys.available = view.keys = keys.available and is_terminal(sys.stdout)
-    with view.watch, Screen(view.status, drawer="ipmsm_can.live_view.drawing", line=lambda s: plain.line(s.run),
-                            news=news), keys:
+    with view.watch, Screen(view.status, drawer="ipmsm_can.live_view.drawing", line=_line, news=news), keys:
         try:
             runner.run(stop, view.observe)
         except BusError as error:
@@ -265,6 +264,14 @@ def _serve(runner: LiveRunner, view: LiveView, news: threading.Event,
     if gone is not None:
         print(f"ipmsm-can monitor: the bus went away after {last.run.elapsed:.1f} s: {gone}", file=sys.stderr)
     return int(gone is not None), last
+
+
+def _line(status: MonitorStatus) -> str:
+    """For pipes: as of `run`, and the gravest finding."""
+    from ipmsm_can.cli import plain
+
+    first = next((f for f in status.findings if f.severity != "notice"), None)
+    return plain.line(status.run) + (f" | {first.severity}: {first.sentence}" if first else "")
 
 
 def _verdict(args: argparse.Namespace, last: MonitorStatus) -> int:
