@@ -121,8 +121,10 @@ class Companion:
         """
         return self.respond(self.feed(block), now_ns)
 
-    def count_usual(self, by_kind: Mapping[MessageKind, int]) -> None:
+    def count_usual(self, by_kind: Mapping[MessageKind, int], unknown: int = 0) -> None:
         """Count frames that a runner dealt with itself."""
+        self.counts.frames += unknown
+        self.counts.unknown += unknown
         for kind, frames in by_kind.items():
             self.counts.frames += frames
             self.counts.by_kind[kind] += frames

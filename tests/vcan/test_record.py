@@ -218,6 +218,7 @@ def test_what_the_kernel_drops_is_counted_shown_and_marked(tmp_path: Path) -> No
     drops = told(r"(\d+) frames dropped by the kernel: they are in no file", text)
     reader = read_log(log)
     recorded = sum(len(b) for b in reader)
+    print(f"\n{3 * len(frames)} frames sent, {drops} dropped by the kernel, {recorded} recorded")
     assert recorded == 3 * len(frames) - drops and drops > 1000
     assert sum(int(m.text.split()[0]) for m in reader.marks if "dropped by the kernel" in m.text) == drops
     assert process.returncode == 1
