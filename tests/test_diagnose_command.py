@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from ipmsm_can.bus.drive_runner import DriveRunner
+from ipmsm_can.bus.port import open_port
 from ipmsm_can.cli import main
+from ipmsm_can.drive.node import DriveNode
+from ipmsm_can.drive.simulation import DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs.writer import write_log
 from ipmsm_can.wire.protocol import Protocol
@@ -167,3 +172,28 @@ def test_a_silent_bus_gives_one_sentence_and_2(tmp_path: Path, capsys: pytest.Ca
     said = refused(capsys, "--drive", toml(tmp_path, drive(None)), "-i", "virtual", "-c", "diagnose_silent",
                    "--duration", "0.2")
     assert "no sample of drive 0 came" in said
+
+
+def test_live_it_listens_to_the_bus_and_sends_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    d = drive("current reversed", 30.0)
+    channel = "diagnose_live"
+    options = {"interface": "virtual", "channel": channel, "fd": True}
+    with open_port(options) as bus, open_port(options) as witness:
+        simulation = DriveSimulation(d.true, d.parameters, d.profile, d.theta_0, d.seed)
+        simulation.run(int(0.4 * d.parameters.sample_rate))  # beyond its first standstill
+        runner = DriveRunner(bus, [DriveNode(PROTOCOL, 0, simulation, replace(d.settings, fd=True), d.faults)])
+        done = threading.Event()
+        thread = threading.Thread(target=runner.run, args=(done.is_set,))
+        thread.start()
+        try:
+            code = main(["diagnose", "--drive", toml(tmp_path, d), "-i", "virtual", "-c", channel, "--fd",
+                         "--duration", "2.5"])
+        finally:
+            done.set()
+            thread.join()
+        assert code == 1
+        assert "ERROR: the current is reversed" in capsys.readouterr().out
+        heard = 0
+        while len(block := witness.receive(0.1)):
+            heard += len(block)
+        assert heard == runner.sent, "somebody else sent"
