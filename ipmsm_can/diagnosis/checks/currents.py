@@ -8,13 +8,14 @@ import math
 import numpy as np
 
 from ipmsm_can.diagnosis import limits
-from ipmsm_can.diagnosis.case import Case
+from ipmsm_can.diagnosis.case import Case, Fit
 from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding, Plot, Series
 from ipmsm_can.diagnosis.parts import evidence, explained, seen, told
 
 _AT_REST_S = 0.05
 _THIRD = 2.0 * math.pi / 3.0
 _DOTS = 400
+_HALF_SURE = 2.5
 
 
 def check(case: Case) -> tuple[list[Finding], list[Checked]]:
@@ -49,6 +50,8 @@ def _offset(case: Case) -> tuple[list[Finding], list[Checked]]:
     else:
         offset, sigma = case.fit.offset, case.fit.solution.pair_sigma("o")
         how = "from how it turns with the saliency"
+        if _confirmed(case.fit, offset, sigma):
+            sigma = min(sigma, abs(offset) / (limits.SURE + 1.0))
         if not (seen(sigma, limit) or told(abs(offset), sigma, limit)):
             return [], [Checked("current offset", "untold", "the rotor turned too little, or the machine is too "
                                 "little salient; log it with the drive off, where it shows at once")]
@@ -71,6 +74,16 @@ def _offset(case: Case) -> tuple[list[Finding], list[Checked]]:
          Evidence("limit", limit, "A", expected=f"{100 * limits.OFFSET:g} % of rated current")),
         plot, size=abs(offset) / limit, order=3)], [
             Checked("current offset", "found", f"{abs(offset):.3f} A {how}")]
+
+
+def _confirmed(fit: Fit, offset: complex, sigma: float) -> bool:
+    """The voltage confirms the offset: with it undone, no constant voltage is left of what its drop at R made.
+
+    That two things so different agree by chance is far less likely than either is uncertain.
+    """
+    left, spread = abs(fit.solution.pair("u")), fit.solution.pair_sigma("u")
+    drop = abs(fit.solution["R"] * offset)
+    return abs(offset) > _HALF_SURE * sigma and left < limits.SURE * spread and drop > 6.0 * max(left, spread)
 
 
 def _dots(case: Case) -> Plot:
