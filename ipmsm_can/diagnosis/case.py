@@ -17,7 +17,7 @@ from ipmsm_can.diagnosis.regression import Solution
 from ipmsm_can.diagnosis.slip import ZeroCourse, find_slips
 from ipmsm_can.diagnosis.windows import Track, Windows, encoder_track, make_windows, stretches, window_length
 from ipmsm_can.diagnosis.wiring import Wiring, find_wiring
-from ipmsm_can.identification.identify import identify
+from ipmsm_can.identification import identify
 from ipmsm_can.motor import Motor
 
 if TYPE_CHECKING:
