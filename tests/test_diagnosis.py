@@ -91,6 +91,8 @@ def test_without_an_encoder(what: str, code: str) -> None:
 def test_a_sound_drive_without_an_encoder(sound: tuple[Measurement, DriveConfig]) -> None:
     report = diagnose(without_encoder(sound[0]), sound[1], thorough=False)
     assert report.worst in (None, "info")
+    untold = {c.name for c in report.checked if c.state == "untold"}
+    assert {"encoder", "current offset", "gain of the current sensors", "delay of the voltage", "L_q"} <= untold
 
 
 def test_the_report_is_the_same_whatever_the_blocks(sound: tuple[Measurement, DriveConfig]) -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+LEAST_IDENTIFIED_S = 0.5
 LEAST_WINDOWS = 60
 """Windows that a fit takes at least."""
 LEAST_TURN = 4.0 * math.pi
@@ -265,16 +266,18 @@ class Case:
     @cached_property
     def identified(self) -> Identification | None:
         """The motor's parameters from the samples with everything undone; None where nothing can be told."""
-        fit = self.fit
-        if fit is None or not self.thorough:
+        if not self.thorough or self.seconds < LEAST_IDENTIFIED_S:
             return None
-        rows = np.flatnonzero(fit.known) if self.by_encoder else np.zeros(0, np.int64)
-        theta, m = fit.x.theta, self.m
-        # Through the silences of the encoder the angle is not known, and no stretch may reach over them.
-        clean = replace(m, i_alpha=fit.x.i.real, i_beta=fit.x.i.imag, v_alpha=fit.x.v.real, v_beta=fit.x.v.imag,
-                        usable=m.usable & fit.known, encoder_sample=m.sample[rows], encoder_theta=theta[rows],
-                        encoder_omega=np.full(rows.size, np.nan), voltage_delay=0.0)
-        found = identify(clean, self.motor)
+        fit, m = self.fit, self.m
+        if self.by_encoder and fit is None:
+            return None
+        x = self.vectors if fit is None else fit.x
+        usable = m.usable if fit is None or not self.by_encoder else m.usable & fit.known
+        rows = np.flatnonzero(usable & np.isfinite(x.theta)) if self.by_encoder else np.zeros(0, np.intp)
+        found = identify(replace(
+            m, i_alpha=x.i.real, i_beta=x.i.imag, v_alpha=x.v.real, v_beta=x.v.imag, usable=usable,
+            encoder_sample=m.sample[rows], encoder_theta=x.theta[rows], encoder_omega=np.full(rows.size, np.nan),
+            voltage_delay=m.voltage_delay if fit is None else 0.0), self.motor)
         return found if found.fits and found.told else None
 
     @cached_property

@@ -53,19 +53,20 @@ def parameters(case: Case) -> list[Parameter]:
     it counts as unknown, whatever the fit says.
     """
     fit = case.fit
-    if fit is None:
-        return []
-    o, s, motor = case.config.observer, fit.solution, case.motor
+    o, motor = case.config.observer, case.motor
     inductance = limits.TOLERANCE * o.inductance_uncertainty / 100.0
-    psi = abs(s.pair("psi"))
     limit = {"psi_m": limits.PSI_M, "R": limits.TOLERANCE * o.resistance_uncertainty / 100.0, "L_q": inductance,
              "L_d": inductance}
-    along_d = _moves_along_d(fit, limits.ALONG_D * motor.rated_current)
+    along_d = fit is not None and _moves_along_d(fit, limits.ALONG_D * motor.rated_current)
     if case.identified is not None:
         exact = case.identified.parameters
         told = {name: exact[name].told and (name != "L_d" or along_d) for name in limit}
         return [Parameter(name, exact[name].value, (exact[name].high - exact[name].low) / (2.0 * limits.SIGMAS_95)
                           if told[name] else math.inf, getattr(motor, name), most) for name, most in limit.items()]
+    if fit is None:
+        return []
+    s = fit.solution
+    psi = abs(s.pair("psi"))
     out = [Parameter("psi_m", psi, s.sigma("psi.x"), motor.psi_m, limits.PSI_M),
            Parameter("R", s["R"], s.sigma("R"), motor.R, limit["R"])]
     if case.by_encoder:
@@ -92,17 +93,18 @@ def check(case: Case) -> tuple[list[Finding], list[Checked]]:
     for p in found:
         unit, factor = _UNIT[p.name]
         if not p.known:
-            checked.append(Checked(p.name, "untold", _why(p.name)))
+            checked.append(Checked(p.name, "untold", _why(p.name, case.by_encoder)))
         else:
             words = f"{factor * p.value:.4g} {unit}, {100.0 * p.share:+.1f} % against drive.toml"
             checked.append(Checked(p.name, "found" if p.off else "fine", words))
     if not case.by_encoder and case.identified is None:
-        checked.append(Checked("L_d, L_q", "untold", "without an encoder the observer's angle holds its own L_q; "
-                               "`ipmsm-can identify` says what a log tells"))
+        checked += [Checked(name, "untold", _why(name, False)) for name in ("L_q", "L_d")]
     return findings, checked
 
 
-def _why(name: str) -> str:
+def _why(name: str, by_encoder: bool) -> str:
+    if not by_encoder and name in ("L_d", "L_q"):
+        return "without an encoder a wrong inductance is a wrong angle that nothing contradicts"
     return {"L_d": "there was next to no current along the d-axis (run with mtpa, or probe)",
             "L_q": "the current hardly changed", "R": "there was too little current",
             "psi_m": "the rotor was too slow"}[name]
