@@ -8,6 +8,7 @@ probing. Its frames are read as a log's.  A fault counts as named when it is the
     python -m tools.faults --seeds 5        the same for five seeds
     python -m tools.faults --more           further faults beside the 24
     python -m tools.faults --no-encoder     the same drives without encoder reports
+    python -m tools.faults --quick          as the live diagnosis judges
 
 exit code 0 where at least 23 of 24 faults are named and no healthy run gives an error.
 """
@@ -191,11 +192,12 @@ MORE: tuple[tuple[str, str, Break], ...] = (
 )
 
 
-def judge(breaks: Break | None, seed: int, number: int, protocol: Protocol, encoder: bool = True) -> Report:
-    """The report on one drive."""
+def judge(breaks: Break | None, seed: int, number: int, protocol: Protocol, encoder: bool = True,
+          thorough: bool = True) -> Report:
+    """The report on one drive; thorough as for `diagnose`."""
     drive = healthy(seed, number, encoder)
     measurement, told = measure(breaks(drive) if breaks else drive, protocol)
-    return diagnose(measurement, told)
+    return diagnose(measurement, told, thorough=thorough)
 
 
 def _words(report: Report) -> str:
@@ -209,6 +211,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=1, help="how many seeds, from --seed on")
     parser.add_argument("--more", action="store_true", help="further faults beside the 24")
     parser.add_argument("--no-encoder", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="the motor's parameters by the quick fit, as live")
     args = parser.parse_args(argv)
     protocol = Protocol()
     faults = FAULTS + (MORE if args.more else ())
@@ -217,12 +220,12 @@ def main(argv: list[str] | None = None) -> int:
         named = alarms = warnings = 0
         print(f"seed {seed}")
         for number, (what, code, breaks) in enumerate(faults):
-            report = judge(breaks, seed, number, protocol, not args.no_encoder)
+            report = judge(breaks, seed, number, protocol, not args.no_encoder, not args.quick)
             right = bool(report.findings) and report.findings[0].code == code
             named += right and number < len(FAULTS)
             print(f"  {'named ' if right else 'MISSED'} {what:40} {_words(report)}")
         for number in range(100, 124):
-            report = judge(None, seed, number, protocol, not args.no_encoder)
+            report = judge(None, seed, number, protocol, not args.no_encoder, not args.quick)
             alarms += report.worst == "error"
             warnings += report.worst == "warning"
             print(f"  {'ALARM ' if report.worst == 'error' else 'fine  '} {f'healthy {number - 99}':40} "

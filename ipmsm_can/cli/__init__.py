@@ -26,6 +26,7 @@ COMMANDS = {
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",
     "diagnose": "what is wrong with a drive, from a log or a live bus",
+    "identify": "the motor's parameters from a log, as a drive.toml",
     "bus": "health of a bus, live or recorded: load, losses, errors, clocks",
     "paper": "run the paper's experiments again, with a verdict on each claim",
     "campaign": "thousands of random runs: is an angle called valid ever wrong",

@@ -17,15 +17,18 @@ from ipmsm_can.diagnosis.regression import Solution
 from ipmsm_can.diagnosis.slip import ZeroCourse, find_slips
 from ipmsm_can.diagnosis.windows import Track, Windows, encoder_track, make_windows, stretches, window_length
 from ipmsm_can.diagnosis.wiring import Wiring, find_wiring
+from ipmsm_can.identification import identify
 from ipmsm_can.motor import Motor
 
 if TYPE_CHECKING:
     from ipmsm_can.analysis.measurement import Measurement
     from ipmsm_can.config.model import DriveConfig
+    from ipmsm_can.identification.result import Identification
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+LEAST_IDENTIFIED_S = 0.5
 LEAST_WINDOWS = 60
 """Windows that a fit takes at least."""
 LEAST_TURN = 4.0 * math.pi
@@ -47,14 +50,16 @@ class Fit:
     """The equation fitted to a measurement whose wiring, slips and errors are undone.
 
     x: the vectors it was fitted to in the end: the angle turned to the magnet and without eccentricity, the voltage
-    shifted, the current without offset and with equal gains.  solution: of the last round, in which what is undone
-    is nearly 0.  zero: encoder minus rotor [rad electrical].  delay: how late the voltage is [samples].
-    offset [A], gain (of the mirrored current), eccentricity [rad electrical]: undone altogether.
+    shifted, the current without offset and with equal gains.  known (N,): samples that count.
+    solution: of the last round, in which what is undone is nearly 0.  zero: encoder minus rotor [rad electrical].
+    delay: how late the voltage is [samples].  offset [A], gain (of the mirrored current), eccentricity
+    [rad electrical]: undone altogether.
     dead_zone: current below which dead time fades out [A].
     """
 
     x: Vectors
     windows: Windows
+    known: Bools
     solution: Solution
     zero: float
     delay: float
@@ -101,10 +106,12 @@ class _Undone:
 class Case:
     """A measurement of a drive, and everything that several checks need of it, worked out once.
 
-    measurement, config: what is judged, and what the drive is said to be.
+    measurement, config: what is judged, and what the drive is said to be.  thorough: the motor's parameters are
+    those of `identification`, which takes a second or so, else those of the quick fit here.
     """
 
-    def __init__(self, measurement: Measurement, config: DriveConfig) -> None:
+    def __init__(self, measurement: Measurement, config: DriveConfig, thorough: bool = True) -> None:
+        self.thorough = thorough
         self.m = measurement
         self.config = config
         self.motor: Motor = config.build_motor()
@@ -230,8 +237,8 @@ class Case:
             if best is not None and s.rms > best.solution.rms:
                 break
             total = undone.plus(step)
-            best = Fit(x, w, s, math.remainder(-total.turned, 2.0 * math.pi), total.delay - self.m.voltage_delay,
-                       total.offset, total.gain, total.eccentricity, zone)
+            best = Fit(x, w, known, s, math.remainder(-total.turned, 2.0 * math.pi),
+                       total.delay - self.m.voltage_delay, total.offset, total.gain, total.eccentricity, zone)
             if step.size(self.motor.rated_current) < _SETTLED:
                 break
             undone = total
@@ -255,6 +262,23 @@ class Case:
             if s.pair_sigma("ecc") < _TOLD_ANGLE:
                 step = replace(step, eccentricity=s.pair("ecc"))
         return step
+
+    @cached_property
+    def identified(self) -> Identification | None:
+        """The motor's parameters from the samples with everything undone; None where nothing can be told."""
+        if not self.thorough or self.seconds < LEAST_IDENTIFIED_S:
+            return None
+        fit, m = self.fit, self.m
+        if self.by_encoder and fit is None:
+            return None
+        x = self.vectors if fit is None else fit.x
+        usable = m.usable if fit is None or not self.by_encoder else m.usable & fit.known
+        rows = np.flatnonzero(usable & np.isfinite(x.theta)) if self.by_encoder else np.zeros(0, np.intp)
+        found = identify(replace(
+            m, i_alpha=x.i.real, i_beta=x.i.imag, v_alpha=x.v.real, v_beta=x.v.imag, usable=usable,
+            encoder_sample=m.sample[rows], encoder_theta=x.theta[rows], encoder_omega=np.full(rows.size, np.nan),
+            voltage_delay=m.voltage_delay if fit is None else 0.0), self.motor)
+        return found if found.fits and found.told else None
 
     @cached_property
     def runs(self) -> list[tuple[int, int]]:

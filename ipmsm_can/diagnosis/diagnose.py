@@ -22,13 +22,14 @@ _LEAST_S = 0.05
 _POINTS = 800
 
 
-def diagnose(measurement: Measurement, config: DriveConfig) -> Report:
+def diagnose(measurement: Measurement, config: DriveConfig, *, thorough: bool = True) -> Report:
     """What is wrong with the drive of `config`, going by a measurement.
 
     Nothing found is said as plainly: `Report.checked` tells what was looked at, and what could not be, and why.
+    thorough: identify the motor's parameters exactly, which takes a second or so; else quickly.
     The same samples give the same report.
     """
-    case = Case(measurement, config)
+    case = Case(measurement, config, thorough)
     facts = _facts(case)
     if case.seconds < _LEAST_S and not (measurement.usable & ~measurement.running).any():
         why = f"only {case.seconds:.3f} s of usable samples of a running drive"

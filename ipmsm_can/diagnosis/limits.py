@@ -24,6 +24,8 @@ PSI_M = 0.075
 """Flux of the magnets, as a share of the name plate's; drive.toml has no key for its uncertainty."""
 TOLERANCE = 2.0
 """R, L_d, L_q in units of the uncertainty that drive.toml tells."""
+ALONG_D = 0.05
+"""Course of i_d from which on L_d can be told, as a share of rated current."""
 ZERO, ZERO_ERROR = math.radians(5.0), math.radians(15.0)
 """Encoder's zero [rad electrical]: notable, and an error."""
 ECCENTRICITY, ECCENTRICITY_ERROR = math.radians(1.5), math.radians(10.0)

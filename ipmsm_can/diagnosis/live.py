@@ -69,8 +69,8 @@ class LiveDiagnosis:
                 self._next = now + self._every
                 self._take()
                 measurement = self._builder.measurement()
-                self._findings = diagnose(measurement, self._config).findings if len(
-                    measurement) and measurement.duration >= LEAST_S else ()
+                enough = len(measurement) > 0 and measurement.duration >= LEAST_S
+                self._findings = diagnose(measurement, self._config, thorough=False).findings if enough else ()
             return self._findings
 
     def report(self, source: str = "live") -> Report:

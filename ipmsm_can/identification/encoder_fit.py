@@ -8,7 +8,7 @@ In the stationary frame, as complex vectors, with theta from the encoder and i_d
 
 The slow correction makes a high pass: the constant of the integral goes away, and so does what little errors of
 the voltage add up to.  The integral of the voltage is exact, as the wire carries means over whole intervals; those
-of R i and e(i) are Simpson's.
+of R i and e(i) come with Runge and Kutta's steps.
 
 The noise is in the currents, so on the side of lambda_c: least squares on columns made of the measured currents
 would find inductances too small.  Columns are therefore made of the currents that the flux of the voltages explains
@@ -32,7 +32,7 @@ from ipmsm_can.motor import Motor
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
-CORNER = 20.0
+CORNER = 10.0
 """Corner of the high pass [1/s]."""
 NAMES = ("R", "L_d", "L_q", "psi_m", "dead_time_voltage", "dead_time_zone", "encoder_zero", "voltage_delay",
          "v_offset_alpha", "v_offset_beta", "i_offset_alpha", "i_offset_beta")
@@ -53,6 +53,16 @@ def start(motor: Motor) -> tuple[Floats, Floats]:
     volts = motor.R * rated + 1.0
     return values, np.array([3.0 * motor.R + 0.1, 3.0 * motor.L_d, 3.0 * motor.L_q, 3.0 * motor.psi_m, 10.0 * volts,
                              1.0, 1.0, 2.0, volts, volts, 0.2 * rated, 0.2 * rated])
+
+
+def bounds(values: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """(lowest, highest) values that are looked at, around those of `start`."""
+    low, high = values - 4.0 * sigma, values + 4.0 * sigma
+    low[[R, DEAD_TIME]] = 0.0
+    low[[L_D, L_Q, PSI_M]] = 0.05 * values[[L_D, L_Q, PSI_M]]
+    low[DELAY], high[DELAY] = -4.0, 4.0
+    low[ENCODER_ZERO], high[ENCODER_ZERO] = -math.pi, math.pi
+    return low, high
 
 
 @kernel
@@ -141,18 +151,19 @@ def evaluate(i: Complexes, v: Complexes, theta: Floats, ts: float, corner: float
         turn_before = turn
         turn = np.exp(1j * (theta[k] - p[ENCODER_ZERO]))
         half_turn = np.exp(1j * (0.5 * (theta[k] + theta[k - 1]) - p[ENCODER_ZERO]))
-        u = applied + v_offset - p[R] * before
+        u = applied + v_offset
+        # Runge and Kutta's step: the voltage stands still while the magnet turns, so the current's path is bent.
         begin, begin_slope, _, _, _ = dead_time(before, zone)
-        # The voltage stands still while the magnet turns: the current's path is bent, by more than its ends tell.
-        middle = _current(flux + 0.5 * ts * (u - p[DEAD_TIME] * begin), half_turn, p)
-        centre, centre_slope, aa, ab, bb = dead_time(middle, zone)
-        u = applied + v_offset - p[R] * middle - p[DEAD_TIME] * centre
-        ahead = _current(flux + ts * u, turn, p)
+        middle = _current(flux + 0.5 * ts * (u - p[R] * before - p[DEAD_TIME] * begin), half_turn, p)
+        centre, _, _, _, _ = dead_time(middle, zone)
+        second = _current(flux + 0.5 * ts * (u - p[R] * middle - p[DEAD_TIME] * centre), half_turn, p)
+        again, centre_slope, aa, ab, bb = dead_time(second, zone)
+        ahead = _current(flux + ts * (u - p[R] * second - p[DEAD_TIME] * again), turn, p)
         end, end_slope, _, _, _ = dead_time(ahead, zone)
-        shape = (begin + 4.0 * centre + end) / 6.0
+        drop = (before + 2.0 * middle + 2.0 * second + ahead) / 6.0
+        shape = (begin + 2.0 * centre + 2.0 * again + end) / 6.0
         slope = (begin_slope + 4.0 * centre_slope + end_slope) / 6.0
-        drop = (before + 4.0 * middle + ahead) / 6.0
-        flux = flux + ts * (applied + v_offset - p[R] * drop - p[DEAD_TIME] * shape)
+        flux = flux + ts * (u - p[R] * drop - p[DEAD_TIME] * shape)
         predicted = _current(flux, turn, p)
 
         _current_changes(change, before, turn_before, p, current)
@@ -193,13 +204,19 @@ def rows(stretches: Sequence[Stretch], sample_rate: float, p: Floats) -> tuple[F
         error = np.empty(len(s), np.complex128)
         c = np.empty((PARAMETERS, len(s)), np.complex128)
         evaluate(s.i, s.v, s.theta, 1.0 / sample_rate, CORNER, p, error, c)
-        use = s.rows.copy()
-        use[:2] = use[-2:] = False
+        use = used(s)
         residual.append(_split(error[use]))
         columns.append(np.stack([c.real[:, use], c.imag[:, use]], axis=1))
         number.append(s.first + np.flatnonzero(use))
     return (np.concatenate(residual, axis=1), np.concatenate(columns, axis=2),
             np.concatenate(number).astype(np.float64))
+
+
+def used(stretch: Stretch) -> NDArray[np.bool_]:
+    """Samples whose prediction error counts: not the first one, nor those that a delay would take from outside."""
+    use = stretch.rows.copy()
+    use[:2] = use[-2:] = False
+    return use
 
 
 def _split(x: Complexes) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -33,8 +34,6 @@ class Solution:
     values: Floats
     covariance: Floats
     reach: float
-    residual: Floats
-    converged: bool
 
 
 def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Floats,
@@ -54,11 +53,11 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
 
     residual, columns = model(p)
     cost = cost_of(p, residual)
-    damping = 1e-3
+    damping, moved = 1e-3, math.inf
     for _ in range(_MOST_STEPS):
         c = columns[:, at]
-        information = c.T @ c + np.diag(believed)
-        slope = c.T @ residual + believed * (p[at] - values[at])
+        information = product(c, c) + np.diag(believed)
+        slope = product(c, residual[:, None])[:, 0] + believed * (p[at] - values[at])
         curvature = np.diag(information)
         step = -np.linalg.solve(information + damping * np.diag(curvature), slope)
         trial = p.copy()
@@ -76,27 +75,40 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
             damping *= 10.0
             if damping > 1e6:
                 return p, moved < 1.0
-    return p, False
+    return p, moved < 1.0
 
 
-def judge(model: Model, values: Floats, sigma: Floats, time: Floats, converged: bool) -> Solution:
-    """The covariance of a solution.  time (K,): of each residual [s].
+def product(a: Floats, b: Floats) -> Floats:
+    """a^T b of tall arrays, on one core: on a busy machine the threads of a BLAS wait for each other, and took
+    a hundred times as long."""
+    return np.asarray(np.einsum("ki,kj->ij", a, b), np.float64)
+
+
+def judge(model: Model, values: Floats, sigma: Floats, time: Floats, first: int,
+          given: Sequence[int] = ()) -> Solution:
+    """The covariance of a solution.  time (K,): of each residual [s].  first: how many of the parameters matter to
+    all of the samples; those after them are initial values of single windows.
 
     The larger one, parameter by parameter, of what white residuals give and of what blocks of them give: residuals
     that remember what came before make the first too small, and few excited blocks the second.
     """
     residual, columns = model(values)
-    size = values.size
-    bread = np.linalg.inv(columns.T @ columns + np.diag(sigma**-2.0))
+    fitted = np.setdiff1d(np.arange(values.size), given)
+    c = columns[:, fitted]
+    bread = np.linalg.inv(product(c, c) + np.diag(sigma[fitted] ** -2.0))
     white = bread * float(np.var(residual))
     span = float(time.max() - time.min()) if time.size else 0.0
     length = min(BLOCK_S, max(_LEAST_BLOCK_S, span / _BLOCKS))
     block = np.floor((time - time.min()) / length).astype(np.int64)
     block = np.unique(block, return_inverse=True)[1]
-    scores = np.stack([np.bincount(block, weights=residual * c) for c in columns.T])
+    scores = np.stack([np.bincount(block, weights=residual * x) for x in c.T])
     blocks = scores.shape[1]
-    freedom = max(blocks - size, _FEWEST)
+    freedom = max(blocks - first, _FEWEST)
     clustered = bread @ (scores @ scores.T) @ bread * (blocks / freedom)
     scale = np.sqrt(np.maximum(np.diag(clustered) / np.diag(white), 1.0))
-    covariance = white * np.outer(scale, scale)
-    return Solution(values, covariance, float(student.ppf(0.975, freedom)), residual, converged)
+    covariance = np.diag(sigma**2.0)
+    covariance[np.ix_(fitted, fitted)] = white * np.outer(scale, scale)
+    if len(given):
+        carried = bread @ product(c, columns[:, list(given)]) * sigma[list(given)]
+        covariance[np.ix_(fitted, fitted)] += carried @ carried.T
+    return Solution(values, covariance, float(student.ppf(0.975, freedom)))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from ipmsm_can.diagnosis import limits
-from ipmsm_can.diagnosis.case import Case
+from ipmsm_can.diagnosis.case import Case, Fit
 from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding
 from ipmsm_can.diagnosis.parts import evidence
 
@@ -44,20 +47,39 @@ class Parameter:
 
 
 def parameters(case: Case) -> list[Parameter]:
-    """What the samples tell of the motor; empty where nothing."""
+    """What the samples tell of the motor; empty where nothing.
+
+    Next to no current along the d-axis leaves L_d to the noise, and to what is not quite right of the angle: then
+    it counts as unknown, whatever the fit says.
+    """
     fit = case.fit
+    o, motor = case.config.observer, case.motor
+    inductance = limits.TOLERANCE * o.inductance_uncertainty / 100.0
+    limit = {"psi_m": limits.PSI_M, "R": limits.TOLERANCE * o.resistance_uncertainty / 100.0, "L_q": inductance,
+             "L_d": inductance}
+    along_d = fit is not None and _moves_along_d(fit, limits.ALONG_D * motor.rated_current)
+    if case.identified is not None:
+        exact = case.identified.parameters
+        told = {name: exact[name].told and (name != "L_d" or along_d) for name in limit}
+        return [Parameter(name, exact[name].value, (exact[name].high - exact[name].low) / (2.0 * limits.SIGMAS_95)
+                          if told[name] else math.inf, getattr(motor, name), most) for name, most in limit.items()]
     if fit is None:
         return []
-    o, s, motor = case.config.observer, fit.solution, case.motor
-    inductance = limits.TOLERANCE * o.inductance_uncertainty / 100.0
+    s = fit.solution
     psi = abs(s.pair("psi"))
     out = [Parameter("psi_m", psi, s.sigma("psi.x"), motor.psi_m, limits.PSI_M),
-           Parameter("R", s["R"], s.sigma("R"), motor.R, limits.TOLERANCE * o.resistance_uncertainty / 100.0)]
+           Parameter("R", s["R"], s.sigma("R"), motor.R, limit["R"])]
     if case.by_encoder:
         # An angle of the observer's holds its own L_q.
         out += [Parameter("L_q", s["L_q"], s.sigma("L_q"), motor.L_q, inductance),
-                Parameter("L_d", s["L_d"], s.sigma("L_d"), motor.L_d, inductance)]
+                Parameter("L_d", s["L_d"], s.sigma("L_d") if along_d else math.inf, motor.L_d, inductance)]
     return out
+
+
+def _moves_along_d(fit: Fit, least: float) -> bool:
+    i_d = (fit.x.i * np.exp(-1j * fit.x.theta)).real[fit.known]
+    low, high = np.quantile(i_d, (0.01, 0.99))
+    return bool(high - low > least)
 
 
 def check(case: Case) -> tuple[list[Finding], list[Checked]]:
@@ -71,17 +93,18 @@ def check(case: Case) -> tuple[list[Finding], list[Checked]]:
     for p in found:
         unit, factor = _UNIT[p.name]
         if not p.known:
-            checked.append(Checked(p.name, "untold", _why(p.name)))
+            checked.append(Checked(p.name, "untold", _why(p.name, case.by_encoder)))
         else:
             words = f"{factor * p.value:.4g} {unit}, {100.0 * p.share:+.1f} % against drive.toml"
             checked.append(Checked(p.name, "found" if p.off else "fine", words))
-    if not case.by_encoder:
-        checked.append(Checked("L_d, L_q", "untold", "without an encoder the observer's angle holds its own L_q; "
-                               "`ipmsm-can identify` says what a log tells"))
+    if not case.by_encoder and case.identified is None:
+        checked += [Checked(name, "untold", _why(name, False)) for name in ("L_q", "L_d")]
     return findings, checked
 
 
-def _why(name: str) -> str:
+def _why(name: str, by_encoder: bool) -> str:
+    if not by_encoder and name in ("L_d", "L_q"):
+        return "without an encoder a wrong inductance is a wrong angle that nothing contradicts"
     return {"L_d": "there was next to no current along the d-axis (run with mtpa, or probe)",
             "L_q": "the current hardly changed", "R": "there was too little current",
             "psi_m": "the rotor was too slow"}[name]
@@ -95,9 +118,11 @@ def _evidence(p: Parameter) -> Evidence:
 def _finding(case: Case, p: Parameter, table: tuple[Evidence, ...]) -> Finding:
     change = f"{100.0 * abs(p.share):.0f} % {'more' if p.share > 0.0 else 'less'}"
     title, sentence, advice = _words(case, p, change)
-    # Iron that saturates lowers L_q, and L_d for one sign of i_d; drive.toml tells how far that may go.
-    saturates = ((p.name == "L_d" or (p.name == "L_q" and p.share < 0.0))
-                 and abs(p.share) < p.limit + case.config.observer.saturation_uncertainty / 100.0)
+    # Iron that saturates lowers L_q; L_d falls or rises with the sign of i_d, and falls with i_q.  drive.toml tells
+    # how far that may go, as 1-sigma.
+    iron = case.config.observer.saturation_uncertainty / 100.0
+    saturates = (p.name == "L_d" and abs(p.share) < p.limit + limits.TOLERANCE * iron) or (
+        p.name == "L_q" and 0.0 < -p.share < p.limit + iron)
     if saturates:
         advice = "Nothing, if the machine saturates at this current; else correct it in drive.toml."
     return Finding(f"motor.{p.name}", "info" if saturates else "warning", title, sentence, advice, table,
