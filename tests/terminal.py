@@ -83,8 +83,11 @@ class Terminal:
         self._stream.feed(data)
         return bool(data)
 
-    def wait(self, words: str, seconds: float = 60.0) -> str:
-        """Until the words are on the screen; returns its text, or fails with it."""
+    def wait(self, words: str, seconds: float = 240.0) -> str:
+        """Until the words are on the screen; returns its text, or fails with it.
+
+        seconds: kernels may have to be compiled first.
+        """
         end = time.monotonic() + seconds
         while words not in self.text:
             left = end - time.monotonic()

@@ -94,9 +94,13 @@ def test_a_recording_without_colours_and_without_unicode(tmp_path: Path) -> None
         t.wait("mark 1 (not recorded)")
         t.look(0.5)
         assert t.text.isascii() and "*" in t.text and "#" in t.text
+        t.wait("played 3 times as fast, over: q ends")
+        t.look(0.5)
+        assert "[x] valid" in t.text and " PAUSED " in t.text, "the last picture, not the silence after it"
+        t.press("q")
         assert t.finish() == 0
     assert not COLOUR.search(t.sent)
-    assert b"0 sent" in t.sent
+    assert b"0 sent" in t.sent and b"last: locked, VALID" in t.sent
     assert re.search(rb"\r\n\d:\d\d\.\d{3} mark 1", t.sent), "the time of a recording's mark is the recording's"
 
 

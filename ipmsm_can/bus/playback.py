@@ -49,7 +49,7 @@ class LogPort:
         while True:
             block = self._due()
             left = end - self._clock()
-            if len(block) or self.finished or left <= 0.0:
+            if len(block) or left <= 0.0:
                 return block
             self._sleep(min(left, _STEP_S))
 

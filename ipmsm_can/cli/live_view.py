@@ -47,6 +47,7 @@ examples:
 
 Press h for the keys. Where standard output is not a terminal there is one line a second, as of `run`. NO_COLOR is
 obeyed; --ascii (or a locale without UTF-8) draws with plain characters.
+A recording that is over stays on the screen until q; where there is no keyboard the program ends with it.
 exit codes: 0 ended by you, by --duration or with the log, 1 there was no bus at the end or a drive sent no samples,
 2 bad input
 """
@@ -125,7 +126,14 @@ def main(args: argparse.Namespace) -> int:
                       _notes(link))
         view = LiveView(runner, controls, watch, clock, source, tap.status)
         view.ascii = args.ascii or not _is_utf8()
-        code, last = _serve(runner, view, news, lambda: stop() or getattr(link.port, "finished", False))
+
+        def ends() -> bool:
+            over = getattr(link.port, "finished", False)
+            if over and view.keys:
+                view.hold_at_end()
+            return bool(stop()) or (over and not view.keys)
+
+        code, last = _serve(runner, view, news, ends)
     code = max(code, recording.code_of(tap), int(record is not None and not record.whole))
     if link.down:
         print(f"ipmsm-can monitor: there is {link.words}", file=sys.stderr)
@@ -252,7 +260,7 @@ def _serve(runner: LiveRunner, view: LiveView, news: threading.Event,
             runner.run(stop, view.observe)
         except BusError as error:
             gone = error
-    view.controls.paused = False
+    view.controls.paused = view.over  # a recording is summed up as it was, not as the silence after it
     view.controls.stop_record()
     last = view.status()
     with contextlib.suppress(OSError):  # a terminal that hung up

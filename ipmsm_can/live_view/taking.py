@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -78,6 +79,9 @@ class LiveView:
         self._rpm = {number: RPM / motor.pole_pairs for number, motor in motors.items()}
         self._rated = {number: motor.rated_current / math.sqrt(2.0) for number, motor in motors.items()}
         self._held: MonitorStatus | None = None
+        self._taking = threading.Lock()
+        self.over = False
+        """What is played is over, and its last picture stays."""
 
     def observe(self, block: FrameBlock, tracked: Sequence[Tracked], answers: FrameBlock, now_ns: int) -> None:
         """Note a round: a few microseconds."""
@@ -91,6 +95,14 @@ class LiveView:
         self.watch.offer(block)
         if self.controls.orders:
             self.controls.lapse()
+
+    def hold_at_end(self) -> None:
+        """The recording that is played is over: its last picture stays, until somebody has seen it."""
+        if not self.over:
+            self.over = True
+            self._held = self._fresh()
+            self.controls.paused = True
+            self.controls.note("the recording is over")
 
     def status(self) -> MonitorStatus:
         """As of now; while it is paused, with the numbers of then."""
@@ -106,11 +118,17 @@ class LiveView:
             run = replace(run, elapsed=now.elapsed, transmit=now.transmit,
                           bus=replace(run.bus, no_bus=now.bus.no_bus))
         return replace(
-            held, run=run, recording=recording.words if recording is not None and runs else "",
+            held, run=run, source=f"{held.source}, over: q ends" if self.over else held.source,
+            checked=self.watch.checked, findings=self.watch.findings,
+            recording=recording.words if recording is not None and runs else "",
             record_trouble=recording.trouble if recording is not None and runs else "", selected=controls.selected,
             page=controls.page, paused=controls.paused, notice=controls.notice, events=controls.events)
 
     def _fresh(self) -> MonitorStatus:
+        with self._taking:
+            return self._take()
+
+    def _take(self) -> MonitorStatus:
         run = self.monitor.status()
         drives = []
         for node in run.nodes:
@@ -126,5 +144,4 @@ class LiveView:
                                                      factor)))
         return MonitorStatus(
             run=run, drives=tuple(drives), source=run.bus.description if self._source is None else self._source,
-            checked=self.watch.checked, findings=self.watch.findings, keys=self.keys,
-            injectable=run.transmit, ascii=self.ascii)
+            keys=self.keys, injectable=run.transmit, ascii=self.ascii)
