@@ -1,4 +1,4 @@
-"""A status of the live view with everything in it, for tests of its picture."""
+"""What the tests of the live view share: a status with everything in it, and frames of a drive."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ import math
 from array import array
 
 from ipmsm_can.cli.status import BusStatus, NodeStatus, RunStatus
+from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
+from ipmsm_can.drive.profile import RPM, constant
+from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
+from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view.status import Course, DriveView, Event, MonitorStatus, Told
+from ipmsm_can.motor import M2
+from ipmsm_can.wire.protocol import Protocol
 
 NODE = NodeStatus(
     node=3, motor="m2", state="locked", live=True, theta=math.radians(-30.0), sigma=math.radians(0.6), omega=314.2,
@@ -31,3 +37,9 @@ EVENTS = (Event("14:03:10", "recording to run.blf"), Event("14:03:11", "mark 1")
 STATUS = MonitorStatus(
     run=RunStatus("ipmsm-can monitor", 83.0, False, BUS, (NODE,)), drives=(DRIVE,), source=BUS.description,
     recording="run.blf 12.3 MB", checked="the bus, drive 3", findings=FINDINGS, events=EVENTS)
+
+
+def samples(n: int, rate: float = 10_000.0, t0_ns: int = 10**18, rpm: float = 600.0) -> FrameBlock:
+    simulation = DriveSimulation(M2, DriveParameters(sample_rate=rate, current_noise=0.02),
+                                 constant(rpm * RPM, 1.0, 60.0))
+    return DriveNode(Protocol(), 0, simulation, DriveNodeSettings(fd=True)).step(n, t0_ns).frames
