@@ -166,7 +166,7 @@ class MappedMonitor:
                                                   (math.nan, 0.0, math.pi, 0, 0.0))
         self._ever |= flags
         flags = flags if live else 0
-        state = follower.verdict
+        state = follower.verdict.partition(":")[0]  # the reason is told at the end: it takes more than a line
         if tracking is not None:
             state = ("locked" if flags & confidence.LOCKED else "tracking, not locked") if flowing else (
                 "no samples any more")
@@ -176,7 +176,7 @@ class MappedMonitor:
             omega=omega, rpm=omega / motor.pole_pairs * RPM, valid=bool(flags & confidence.VALID),
             locked=bool(flags & confidence.LOCKED), polarity_known=bool(flags & confidence.POLARITY_KNOWN),
             excitation=excitation, injection="none: a mapped inverter is only listened to", injecting=False,
-            amplitude=0.0, hf_current=0.0, sample_rate=tracking.summary.sample_rate if tracking else 0.0,
+            amplitude=0.0, hf_current=0.0, sample_rate=follower.rate,
             samples_per_s=samples_per_s, estimates_per_s=samples_per_s if live else 0.0, received=follower.samples,
             lost=tracking.lost if tracking else 0, filled=tracking.filled if tracking else 0, gaps=0, duplicates=0,
             reordered=0, resyncs=0, restarts=0, bad_frames=tracking.unusable if tracking else 0,

@@ -31,7 +31,8 @@ class Follower:
     config: of the drive, for its motor and the observer.  plan: from `make_plan`.
     tracking: the fast observer, where the signals allow it; steady: the steady-state quantities, where only those;
     both None while it looks, and where neither is possible: then it goes on looking.
-    verdict: what is done and why, in a sentence.  notes: what is missing or doubtful.  samples: so far.
+    verdict: what is done and why, in a sentence.  notes: what is missing or doubtful.  samples: so far; rate: of
+    them [Hz], 0 while it looks.
     """
 
     def __init__(self, config: DriveConfig, plan: Plan, look_s: float = LOOK_S) -> None:
@@ -42,6 +43,7 @@ class Follower:
         self.verdict = _NOTHING_CAME
         self.notes: list[str] = []
         self.samples = 0
+        self.rate = 0.0
         self.last_ns = 0
         """Arrival of the newest sample [ns]."""
         self._look_ns = round(1e9 * look_s)
@@ -106,6 +108,7 @@ class Follower:
         else:
             self.verdict = f"nothing can be made of the signals: {fast.why}; {steady.why}"
             return False
+        self.rate = survey.rate
         self._mapper = Mapper(self.plan, survey.rate)
         return True
 
