@@ -35,7 +35,7 @@ LEAST_TURN = 4.0 * math.pi
 """Angle [rad electrical] that the rotor must turn for anything to be said of an encoder."""
 CLEAR_EMF = 6.0
 """The back-EMF that counts as turning, in units of what the voltage may be wrong by."""
-_MOST_WINDOWS = 20_000
+_MOST_WINDOWS = 10_000
 _AROUND_SLIP_S = 0.03
 _MOST_DELAY = 4.0
 _ROUNDS, _SETTLED = 8, 1e-3

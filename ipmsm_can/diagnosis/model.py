@@ -20,6 +20,7 @@ Only the current offset needs the saliency; a machine without any does not tell 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -64,18 +65,30 @@ def dead_time_direction(i: Complexes, zone: float) -> Complexes:
     return np.asarray((2.0 * a - b - c) / 3.0 + 1j * (b - c) / math.sqrt(3.0))
 
 
-def _between(values: Complexes) -> Complexes:
-    """Mean of neighbours: for each interval that ends at a sample."""
-    out = values.copy()
-    out[1:] = 0.5 * (values[1:] + values[:-1])
-    return out
+@dataclass(frozen=True, slots=True)
+class _Edge:
+    """Current [A], angle's direction and angle [rad] where windows begin, or where they end, all (W,)."""
+
+    i: Complexes
+    turn: Complexes
+    theta: Floats
+
+
+def _edges(w: Windows, x: Vectors) -> tuple[_Edge, _Edge]:
+    """Begin and end.  Only what is needed of a long measurement is worked out."""
+    begin, end = (_Edge(x.i[at], np.exp(1j * x.theta[at]), x.theta[at]) for at in (w.begin, w.end))
+    return begin, end
+
+
+def _change(edges: tuple[_Edge, _Edge], of: Callable[[_Edge], Complexes]) -> Complexes:
+    return np.asarray(of(edges[1]) - of(edges[0]))
 
 
 def core_columns(w: Windows, x: Vectors) -> dict[str, Complexes]:
     """R, L_s, the saliency l and the magnet's psi; complex unknowns as .x and .y."""
-    turn = np.exp(1j * x.theta)
-    salient, magnet = w.change(turn**2 * x.i.conj()), w.change(turn)
-    return {"R": w.i, "L_s": w.change(x.i), "l.x": salient, "l.y": 1j * salient, "psi.x": magnet,
+    edges = _edges(w, x)
+    salient, magnet = _change(edges, lambda e: e.turn**2 * e.i.conj()), _change(edges, lambda e: e.turn)
+    return {"R": w.i, "L_s": _change(edges, lambda e: e.i), "l.x": salient, "l.y": 1j * salient, "psi.x": magnet,
             "psi.y": 1j * magnet}
 
 
@@ -100,10 +113,10 @@ def core_prior(motor: Motor) -> dict[str, tuple[float, float]]:
 
 def motor_columns(w: Windows, x: Vectors) -> dict[str, Complexes]:
     """R, L_d, L_q and the magnet's psi, where the angle's zero is about right."""
-    turn = np.exp(1j * x.theta)
-    dq = x.i * turn.conj()
-    magnet = w.change(turn)
-    return {"R": w.i, "L_d": w.change(turn * dq.real), "L_q": w.change(1j * turn * dq.imag), "psi.x": magnet,
+    edges = _edges(w, x)
+    magnet = _change(edges, lambda e: e.turn)
+    return {"R": w.i, "L_d": _change(edges, lambda e: e.turn * (e.i * e.turn.conj()).real),
+            "L_q": _change(edges, lambda e: 1j * e.turn * (e.i * e.turn.conj()).imag), "psi.x": magnet,
             "psi.y": 1j * magnet}
 
 
@@ -117,23 +130,26 @@ def error_columns(w: Windows, x: Vectors, found: Solution, motor: Motor, zone: f
     """What each error of size 1 adds, around the motor as found; the saliency is the one that was told, as i_d may
     not have moved enough to tell."""
     T_s = 1.0 / x.sample_rate
-    turn = np.exp(1j * x.theta)
+    edges = _edges(w, x)
     R, psi = found["R"], found.pair("psi")
     L_s, half = motor.L_s, 0.5 * motor.L_0
     ones = np.full(len(w), w.period, np.complex128)
-    mirrored = R * w.i.conj() + L_s * w.change(x.i.conj())
-    salient = half * w.change(turn**2 * x.i)
-    offset = -half * w.change(turn**2)
-    next_v = np.concatenate([x.v[1:], x.v[-1:]])
-    late = -T_s * w.change(0.5 * (x.v + next_v))
-    shaft = x.theta / motor.pole_pairs
+    mirrored = R * w.i.conj() + L_s * _change(edges, lambda e: e.i.conj())
+    salient = half * _change(edges, lambda e: e.turn**2 * e.i)
+    offset = -half * _change(edges, lambda e: e.turn**2)
+    last = len(x.v) - 1
+    late = -0.5 * T_s * (w.change(x.v) + x.v[np.minimum(w.end + 1, last)] - x.v[np.minimum(w.begin + 1, last)])
+    signs = dead_time_direction(w.samples(x.i), zone)
+    wave = [1j * psi * _change(edges, lambda e, f=f: e.turn * f(e.theta / motor.pole_pairs))  # type: ignore[misc]
+            for f in (np.cos, np.sin)]
     return {
         "u.x": ones, "u.y": 1j * ones,
-        "dead_time": T_s * w.sum(_between(dead_time_direction(x.i, zone))),
+        # The mean of neighbours for each interval: the trapezoid again.
+        "dead_time": T_s * (signs.sum(axis=1) - 0.5 * (signs[:, 0] + signs[:, -1])),
         "o.x": offset, "o.y": -1j * offset,
         "g.x": -(mirrored + salient), "g.y": -1j * (mirrored - salient),
         "delay": late,
-        "ecc.x": 1j * psi * w.change(turn * np.cos(shaft)), "ecc.y": 1j * psi * w.change(turn * np.sin(shaft)),
+        "ecc.x": wave[0], "ecc.y": wave[1],
     }
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can.diagnosis.model import Vectors
+from ipmsm_can.diagnosis.model import Vectors, motor_columns
 from ipmsm_can.diagnosis.windows import Windows
 from ipmsm_can.motor import Motor
 
@@ -61,10 +61,9 @@ class ZeroCourse:
 
 def _courses(w: Windows, x: Vectors, motor: Motor, volts: float) -> tuple[NDArray[np.int64], Floats]:
     """Row and angle of the magnet against the encoder [rad], where it turns fast enough to tell."""
-    turn = np.exp(1j * x.theta)
-    dq = x.i * turn.conj()
-    rest = w.v - motor.R * w.i - w.change(turn * (motor.L_d * dq.real + 1j * motor.L_q * dq.imag))
-    magnet = w.change(turn)
+    c = motor_columns(w, x)
+    rest = w.v - motor.R * c["R"] - motor.L_d * c["L_d"] - motor.L_q * c["L_q"]
+    magnet = c["psi.x"]
     n = max(1, round(_BLOCK_S / w.period), -(-len(w) // _MOST_BLOCKS))
     blocks = len(w) // n
     cut = slice(0, blocks * n)

@@ -69,10 +69,10 @@ class Windows:
         """By how much a quantity given at every sample (N,) changes over each window."""
         return np.asarray(values[self.end] - values[self.begin])
 
-    def sum(self, values: Complexes) -> Complexes:
-        """Sum of a quantity given for the interval that ends at every sample (N,) over each window."""
-        total = np.cumsum(values)
-        return np.asarray(total[self.end] - total[self.begin])
+    def samples(self, values: Complexes) -> Complexes:
+        """A quantity given at every sample (N,), of each window's samples (W, length + 1)."""
+        length = int(self.end[0] - self.begin[0]) if len(self) else 0
+        return np.asarray(values[self.begin[:, None] + np.arange(length + 1)])
 
 
 def encoder_track(m: Measurement) -> Track:

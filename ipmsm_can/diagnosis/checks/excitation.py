@@ -13,12 +13,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.config.build import probing_frequency
 from ipmsm_can.diagnosis import limits
 from ipmsm_can.diagnosis.case import Case
 from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding
 from ipmsm_can.experiments.conditions import window_levels
 
 _MEAN_S = 2e-3
+_MEANS_A_PERIOD = 5.0
 _STANDS = math.radians(2.0)
 _SCATTER = 3.0
 
@@ -33,13 +35,12 @@ def required(case: Case) -> float:
 def levels(case: Case) -> tuple[NDArray[np.float64], Bools, Bools]:
     """C1's level [V^2 s] of every window, whether the rotor stood in it, and whether the drive probed in it."""
     m, motor, x = case.m, case.motor, case.vectors
-    noise = case.noise
     found, stood, probed = [], [], []
     for begin, end in case.runs:
         span = slice(begin, end)
         injecting = bool(m.injecting[span].any())
-        # The probing signal must not be averaged away; else means keep the noise low.
-        size = 1 if injecting else max(1, round(_MEAN_S * m.sample_rate))
+        # Means keep the noise low, but must not average the probing signal away.
+        size = _mean_samples(case, injecting)
         dt, n = size / m.sample_rate, max(2, round(limits.WINDOW_S * m.sample_rate / size))
         i, v = x.i[span], x.v[span]
         emf = v[1:] - 0.5 * motor.R * (i[1:] + i[:-1])
@@ -48,8 +49,7 @@ def levels(case: Case) -> tuple[NDArray[np.float64], Bools, Bools]:
             continue
         mean = emf[:whole].reshape(-1, size).mean(axis=1)
         u = mean - motor.L_s * np.diff(i[:whole + 1:size]) / dt
-        of_noise = (motor.R**2 + 2.0 * (motor.L_s / dt) ** 2) * noise**2 * n * dt * (
-            1.0 + _SCATTER * math.sqrt(3.0 / n))
+        of_noise = _of_noise(case, dt, n)
         at = np.arange(0, u.size - n + 1, n)
         found.append(window_levels(u, dt, n)[at] - of_noise)
         theta = x.theta[span] if case.has_encoder else np.full(end - begin, np.nan)
@@ -63,11 +63,28 @@ def levels(case: Case) -> tuple[NDArray[np.float64], Bools, Bools]:
     return np.concatenate(found), np.concatenate(stood), np.concatenate(probed)
 
 
+def _mean_samples(case: Case, injecting: bool) -> int:
+    frequency = probing_frequency(case.config, case.m.sample_rate)
+    return max(1, int((1.0 / (_MEANS_A_PERIOD * frequency) if injecting else _MEAN_S) * case.m.sample_rate))
+
+
+def _of_noise(case: Case, dt: float, n: int) -> float:
+    """What the noise of the current alone can make of the level of n means over dt [s] each [V^2 s]."""
+    motor = case.motor
+    power = (motor.R**2 + 2.0 * (motor.L_s / dt) ** 2) * case.noise**2
+    return power * n * dt * (1.0 + _SCATTER * math.sqrt(3.0 / n))
+
+
 def probing_needed(case: Case) -> float:
-    """Amplitude [V peak] of rotating probing that shows the position of a rotor at rest; inf without saliency."""
+    """Amplitude [V peak] of rotating probing that shows the position of a rotor at rest above noise and errors of
+    the voltage; inf without saliency.  What dead time and the current control take of it comes on top."""
     motor = case.motor
     share = abs(motor.L_0) / (2.0 * motor.L_s)
-    return math.sqrt(2.0) * case.volts / share if share > 1e-3 else math.inf
+    if share <= 1e-3:
+        return math.inf
+    dt = _mean_samples(case, True) / case.m.sample_rate
+    level = required(case) + _of_noise(case, dt, max(2, round(limits.WINDOW_S / dt)))
+    return math.sqrt(2.0 * level / limits.WINDOW_S) / share
 
 
 def check(case: Case) -> tuple[list[Finding], list[Checked]]:
