@@ -104,6 +104,15 @@ class Companion:
         flowing = [n for n in (node.frames_until_due(now_ns) for node in self.nodes.values()) if n]
         return min(flowing) if flowing else 1
 
+    def order_injection(self, node: int, wanted: bool | None) -> None:
+        """The operator's order: True inject, False do not, None leave it to the scheduler; within the limits of the
+        configuration, from the node's next command on.  May be called from another thread.
+
+        Without `transmit` it has no effect: nothing is ever sent then.
+        """
+        if self.transmit:
+            self.nodes[node].scheduler.operator(wanted)
+
     def process(self, block: FrameBlock, now_ns: int) -> FrameBlock:
         """Take in frames and give back what is to be sent now.
 
@@ -112,8 +121,10 @@ class Companion:
         """
         return self.respond(self.feed(block), now_ns)
 
-    def count_usual(self, by_kind: Mapping[MessageKind, int]) -> None:
+    def count_usual(self, by_kind: Mapping[MessageKind, int], unknown: int = 0) -> None:
         """Count frames that a runner dealt with itself."""
+        self.counts.frames += unknown
+        self.counts.unknown += unknown
         for kind, frames in by_kind.items():
             self.counts.frames += frames
             self.counts.by_kind[kind] += frames

@@ -2,7 +2,8 @@
 
 A row of `FrameBlock.raw` is Linux' `struct canfd_frame`, 72 bytes: can_id with the flag bits
 CAN_EFF_FLAG, CAN_RTR_FLAG and CAN_ERR_FLAG (4 bytes, host order), payload length in bytes (1), FD
-flags (1), two reserved bytes, 64 bytes of payload.  SocketCAN writes such rows straight into the array;
+flags (1), two reserved bytes (the first tells a recorder of a frame that was SENT), 64 bytes of payload.
+SocketCAN writes such rows straight into the array;
 a classical frame is a row without CANFD_FDF whose payload ends at byte 8.
 """
 
@@ -26,6 +27,9 @@ CAN_SFF_MASK = 0x7FF
 CANFD_BRS = 0x01
 CANFD_ESI = 0x02
 CANFD_FDF = 0x04
+
+SENT = 0x01
+"""In the first reserved byte of a row that goes into a recording: this program sent the frame."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,10 +52,11 @@ def test_every_help_has_examples(command: str, capsys: pytest.CaptureFixture[str
     assert f"ipmsm-can {command}" in examples
 
 
-@pytest.mark.parametrize("command", ["run", "drive"])
+@pytest.mark.parametrize("command", ["run", "drive", "monitor"])
 def test_examples_of_the_bus_commands_are_accepted(command: str) -> None:
     parser = build_parser([command])
-    text = sys.modules[f"ipmsm_can.cli.{command}"].EPILOG
+    module = {"monitor": "live_view"}.get(command, command)
+    text = sys.modules[f"ipmsm_can.cli.{module}"].EPILOG
     lines = [line.split("  ")[0].split("|")[0] for line in map(str.strip, text.splitlines())
              if line.startswith(("ipmsm-can ", "CAN_"))]
     assert len(lines) >= 3

@@ -20,7 +20,7 @@ from ipmsm_can.bus.socketcan import MessageTable
 from ipmsm_can.bus.warmup import warm_up_companion
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
-from ipmsm_can.frames import FrameBlock
+from ipmsm_can.frames import CAN_EFF_FLAG, CAN_RTR_FLAG, FrameBlock
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the loop is for Linux only")
@@ -186,7 +186,7 @@ def test_a_backlog_over_many_laps_is_not_answered(port: Port, clock_every: int) 
     k = refresh(companion, k, 10, 5000.0)
     answered = companion.nodes[0].view.estimates
     stranger = FrameBlock.zeros(1)
-    stranger.can_id[:] = 0x7FF
+    stranger.can_id[:] = 0x100 | CAN_RTR_FLAG
     stranger.length[:] = 8
     for _ in range(10):
         port.put(samples(k, 50))
@@ -202,6 +202,31 @@ def test_a_backlog_over_many_laps_is_not_answered(port: Port, clock_every: int) 
 
 def answers_of(lap: Lap) -> int:
     return int((lap.sent.can_id == POSITION).sum())
+
+
+def test_frames_of_nobody_here_pass_through_the_loop(port: Port) -> None:
+    """A bus with other traffic on it is the usual case; they are kept for who records, and counted."""
+    companion, k = following(QUIET, 5000.0)
+    lane = FastLane(port, companion)
+    lane.run(0.001, time.time_ns())
+    k = refresh(companion, k, 10, 5000.0)
+    before = companion.counts.unknown, companion.counts.frames
+    foreign = FrameBlock.zeros(2)
+    foreign.can_id[:] = 0x5FF, 0x100 | CAN_EFF_FLAG
+    foreign.length[:] = 8
+    for _ in range(6):
+        port.put(samples(k, 5))
+        port.put(foreign.raw)
+        k += 5
+    laps = [turn(lane, companion) for _ in range(12)]
+    taken = FrameBlock.concat([lap.taken for lap in laps])
+    assert not sum(len(lap.left) for lap in laps)
+    assert len(taken) == 42 and sum(lap.foreign for lap in laps) == 12
+    assert np.isin(taken.can_id, foreign.can_id).sum() == 12
+    assert sum(sum(lap.by_kind.values()) for lap in laps) == 30
+    for lap in laps:
+        companion.count_usual(lap.by_kind, lap.foreign)
+    assert (companion.counts.unknown - before[0], companion.counts.frames - before[1]) == (12, 42)
 
 
 def test_a_due_sample_ends_its_batch_beyond_the_counters_wrap(port: Port) -> None:

@@ -51,7 +51,7 @@ class Lap:
     left: frames not dealt with.
     sent: answers sent, at the time of what they answer.  unsent: answers that the port would not take.
     silent: it ended because no frame came in time, or none can.  took: some of the turnarounds [s].
-    late: answers withheld because their samples were read too late.
+    late: answers withheld because their samples were read too late.  foreign: frames taken that are nobody's here.
     """
 
     taken: FrameBlock
@@ -63,6 +63,7 @@ class Lap:
     silent: bool
     took: NDArray[np.float64]
     late: int
+    foreign: int
 
 
 class LanePort(Protocol):
@@ -140,7 +141,8 @@ class FastLane:
         none = np.zeros(0, np.intp)
         self._wire = loop.Wire(
             decoder(MessageKind.DRIVE_SAMPLE), decoder(MessageKind.DRIVE_TIMING), decoder(MessageKind.DRIVE_STATUS),
-            frame(MessageKind.DRIVE_REFERENCE), encoder(MessageKind.POSITION_ESTIMATE, self._node.position_rows),
+            frame(MessageKind.DRIVE_REFERENCE), companion.protocol.id_lut,
+            encoder(MessageKind.POSITION_ESTIMATE, self._node.position_rows),
             encoder(MessageKind.ACTIVE_FLUX_ESTIMATE, self._node.flux_rows),
             encoder(MessageKind.COMPANION_STATUS, none), protection.data_ids, self._node.receiver.sample_ends)
         self._state_row = codecs[MessageKind.COMPANION_STATUS].index["state"]
@@ -217,7 +219,7 @@ class FastLane:
         records = loop.LaneRecords(sequencer.state, sequencer.counts, rp, rs, op, os, sp, ex, cf, node.meter)
         why = loop.lap(plan, self._wire, self._incoming, self._outgoing, records, self._kept, result)
         (taken, done, left, sent, unsent, first, counter, samples, timings, statuses, next_status,
-         timed, late) = result.tolist()
+         timed, late, foreign) = result.tolist()
         node.view.estimates += counter - node.position_counter
         node.position_counter = counter
         node.next_status = next_status
@@ -225,7 +227,7 @@ class FastLane:
         frames = FrameBlock(kept.raw[:taken].copy(), kept.t_ns[:taken].copy())
         by_kind = {MessageKind.DRIVE_SAMPLE: samples, MessageKind.DRIVE_TIMING: timings,
                    MessageKind.DRIVE_STATUS: statuses,
-                   MessageKind.DRIVE_REFERENCE: taken - samples - timings - statuses}
+                   MessageKind.DRIVE_REFERENCE: taken - samples - timings - statuses - foreign}
         last_ns = kept.t_ns[taken - 1] if taken else now_ns
         tracked = self._tracked(done) if done else []
         if by_kind[MessageKind.DRIVE_REFERENCE]:
@@ -237,7 +239,7 @@ class FastLane:
                    FrameBlock(kept.sent_words[:sent].copy().view(np.uint8), kept.sent_t_ns[:sent].copy()),
                    FrameBlock(self._outgoing.frames[first:first + unsent].copy(),
                               np.full(unsent, last_ns, np.int64)),
-                   why == loop.SILENCE, kept.took[:timed].copy(), late)
+                   why == loop.SILENCE, kept.took[:timed].copy(), late, foreign)
 
     def check_bus(self) -> None:
         """Raise BusError where there is nothing to wait for; the loop does not tell silence from an interface that

@@ -18,6 +18,7 @@ from ipmsm_can.estimation import regression, speed
 from ipmsm_can.estimation.confidence import VALID
 from ipmsm_can.estimation.estimator import estimate_block
 from ipmsm_can.estimation.observers import common
+from ipmsm_can.frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_SFF_MASK
 from ipmsm_can.injection.meter import meter_block
 from ipmsm_can.wire.answers import due_among, flux_values, position_values, tracking_state
 from ipmsm_can.wire.e2e import crc_p02
@@ -79,13 +80,14 @@ class Encoder(NamedTuple):
 
 
 class Wire(NamedTuple):
-    """The messages; reference: header word of DriveReference, which is only counted; ends: `range_ends` of
-    a DriveSample."""
+    """The messages; reference: header word of DriveReference, which is only counted; known: `Protocol.id_lut`;
+    ends: `range_ends` of a DriveSample."""
 
     sample: Decoder
     timing: Decoder
     status: Decoder
     reference: np.uint64
+    known: NDArray[np.int16]
     position: Encoder
     flux: Encoder
     companion: Encoder
@@ -187,11 +189,18 @@ class Kept(NamedTuple):
 
 
 (TAKEN, SAMPLES, LEFT, SENT, UNSENT_FRAMES, FIRST_UNSENT, COUNTER, SAMPLE_FRAMES, TIMINGS, STATUSES, NEXT_STATUS,
- TIMED, LATE, RESULTS) = range(14)
+ TIMED, LATE, FOREIGN, RESULTS) = range(15)
 """What `lap` says in its array: frames taken in, samples estimated, frames of the last batch left alone, answers
 sent and not sent, row of the first of those, PositionEstimates sent so far; DriveSamples, DriveTimings and
 DriveStatuses taken in; when CompanionStatus is due next, turnarounds measured, PositionEstimates withheld for
-being late."""
+being late; frames with identifiers that are nobody's here."""
+
+
+@kernel
+def _is_foreign(word: np.uint64, known: NDArray[np.int16]) -> bool:
+    """Whether a frame with this header has an identifier that is nobody's here, as `Protocol.classify` has it."""
+    header = np.int64(word)
+    return bool(header & CAN_ERR_FLAG == 0 and (header & CAN_EFF_FLAG != 0 or known[header & CAN_SFF_MASK] < 0))
 
 
 @kernel
@@ -266,6 +275,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
         events = 0
         timings = 0
         statuses = 0
+        foreign = 0
         kind = np.empty(n, np.int64)
         low = np.empty(n, np.int64)
         rate = np.zeros(n)
@@ -302,6 +312,8 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
                 decode_block(words, row, True, 1, h.table, h.scaling, h.ranges, heard)
                 strange |= not _says_the_same(heard, h.rows, plan)
                 statuses += 1
+            elif _is_foreign(words[k, 0], wire.known):
+                foreign += 1
             elif words[k, 0] != wire.reference:
                 strange = True
         room = (plan.max_gap + 1) * events
@@ -334,6 +346,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
         result[SAMPLE_FRAMES] += events - timings
         result[TIMINGS] += timings
         result[STATUSES] += statuses
+        result[FOREIGN] += foreign
         now = t_ns[n - 1]
         if begin < 0:
             begin = now

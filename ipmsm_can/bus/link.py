@@ -67,6 +67,16 @@ class Link:
         return self._since_ns is not None
 
     @property
+    def since_ns(self) -> int:
+        """Unix time [ns] at which the present outage began; 0 where there is none."""
+        return self._since_ns or 0
+
+    @property
+    def cause(self) -> str:
+        """What was said when the bus went away last."""
+        return self._cause
+
+    @property
     def drops(self) -> int:
         """`Port.drops` of all ports so far."""
         return self._drops + self.port.drops

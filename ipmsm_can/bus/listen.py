@@ -8,26 +8,29 @@ from collections.abc import Callable
 from ipmsm_can.bus.health import BusHealth
 from ipmsm_can.bus.health_report import HealthReport
 from ipmsm_can.bus.link import Link
-from ipmsm_can.bus.live import GATHER_S
+from ipmsm_can.bus.live import GATHER_S, Observer
 from ipmsm_can.bus.port import BusError
 from ipmsm_can.frames import FrameBlock
 
 _WAIT_S = 0.1
 _SILENT_NS = 300_000_000
+_NOTHING = FrameBlock.zeros(0)
 
 
 class Listener:
     """Feeds a `BusHealth` from a link.
 
     counts_drops: the port knows what the kernel dropped.  reconnect: go on when the bus comes back; else `run`
-    raises BusError.
+    raises BusError.  observer: is shown every block, as those of `LiveRunner` are.
     """
 
-    def __init__(self, link: Link, health: BusHealth, counts_drops: bool, reconnect: bool = True) -> None:
+    def __init__(self, link: Link, health: BusHealth, counts_drops: bool, reconnect: bool = True,
+                 observer: Observer | None = None) -> None:
         self.link = link
         self.health = health
         self._counts_drops = counts_drops
         self._reconnect = reconnect
+        self._observer = observer
         self._newest: tuple[int, float] | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -55,6 +58,8 @@ class Listener:
         self.health.update(block)
         if len(block):
             self._newest = int(block.t_ns[-1]), time.monotonic()
+        if self._observer is not None:
+            self._observer(block, (), _NOTHING, 0 if self._newest is None else self._newest[0])
 
     def report(self) -> HealthReport:
         """As of now; may be called from another thread."""

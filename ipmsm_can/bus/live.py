@@ -157,7 +157,7 @@ class LiveRunner:
         self.sent += len(lap.sent)
         for took in lap.took.tolist():
             self._note_turnaround(took)
-        companion.count_usual(lap.by_kind)
+        companion.count_usual(lap.by_kind, lap.foreign)
         companion.late += lap.late
         unstamped = lap.left.t_ns < 0
         if unstamped.any():

@@ -21,6 +21,7 @@ from ipmsm_can.frames import (
     CANFD_ESI,
     CANFD_FDF,
     FRAME_BYTES,
+    SENT,
     FrameBlock,
 )
 
@@ -83,7 +84,8 @@ def messages_from_block(block: FrameBlock, channel: str | None = None) -> list[c
             arbitration_id=can_id & (CAN_EFF_MASK if is_extended or is_error else CAN_SFF_MASK),
             is_extended_id=is_extended, is_remote_frame=is_remote, is_error_frame=is_error, is_fd=is_fd,
             bitrate_switch=bool(flags & CANFD_BRS), error_state_indicator=bool(flags & CANFD_ESI),
-            dlc=length, data=None if is_remote else raw[at + 8:at + 8 + length], channel=channel))
+            is_rx=not raw[at + 6] & SENT, dlc=length, data=None if is_remote else raw[at + 8:at + 8 + length],
+            channel=channel))
     return messages
 
 

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ipmsm_can.bus.absence import Identifiers
 from ipmsm_can.bus.rows import RowBlock
 from ipmsm_can.companion import Companion
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import confidence, speed
 from ipmsm_can.estimation.observers import ges
-from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_SFF_MASK, FrameBlock
+from ipmsm_can.frames import FrameBlock
 from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import NODES, MessageKind, Protocol
 from ipmsm_can.wire.sequence import SampleRun
@@ -161,15 +162,17 @@ class NodeSummary:
 class Replay:
     """Feeds blocks of a log to a companion and hands rows to `sink`.
 
-    configs: the drives; `prepare` should have looked at them.  sink: may be None.
-    summaries, companion: results by node number.  standard_ids (2048,), extended_ids: frames by identifier.
+    configs: the drives; `prepare` should have looked at them.  sink: may be None.  tap: is shown each block with
+    what was estimated from it.
+    summaries, companion: results by node number.  seen: the identifiers of the log.
     """
 
-    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, sink: Sink | None = None) -> None:
+    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, sink: Sink | None = None,
+                 tap: Callable[[FrameBlock, Sequence[Tracked]], None] | None = None) -> None:
+        self._tap = tap
         self.companion = Companion(configs, protocol, transmit=False)
         self.summaries = {c.wire.node: NodeSummary() for c in configs}
-        self.standard_ids = np.zeros(CAN_SFF_MASK + 1, np.int64)
-        self.extended_ids: set[int] = set()
+        self.seen = Identifiers()
         self._protocol = protocol
         self._sink = sink
         self._clocks = {c.wire.node: SampleClock() for c in configs}
@@ -178,18 +181,13 @@ class Replay:
         """Take in the next frames of the log."""
         if not len(block):
             return
-        self._note_ids(block)
+        self.seen.note(block)
         self._references(block)
-        for part in self.companion.feed(block):
+        tracked = self.companion.feed(block)
+        for part in tracked:
             self._rows(part)
-
-    def _note_ids(self, block: FrameBlock) -> None:
-        ids = block.can_id
-        plain = ids[(ids & np.uint32(CAN_EFF_FLAG | CAN_ERR_FLAG)) == 0] & np.uint32(CAN_SFF_MASK)
-        self.standard_ids += np.bincount(plain, minlength=CAN_SFF_MASK + 1)
-        extended = ids[(ids & np.uint32(CAN_EFF_FLAG | CAN_ERR_FLAG)) == CAN_EFF_FLAG]
-        if extended.size and len(self.extended_ids) < 1000:
-            self.extended_ids.update(np.unique(extended & np.uint32(CAN_EFF_MASK)).tolist())
+        if self._tap is not None:
+            self._tap(block, tracked)
 
     def _references(self, block: FrameBlock) -> None:
         kind = MessageKind.DRIVE_REFERENCE
@@ -223,11 +221,6 @@ class Replay:
                 run.counter, run.filled, time_s, theta, e.angle[speed.OMEGA], valid.view(np.uint8),
                 locked.view(np.uint8), part.injecting, e.excitation, e.flux[ges.LAMBDA_A],
                 e.flux[ges.LAMBDA_B]))
-
-    def sample_frames(self, node: int) -> int:
-        """How many frames the log had under the identifiers of this drive's samples."""
-        return sum(int(self.standard_ids[self._protocol.base_ids[kind] + node])
-                   for kind in (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK))
 
 
 def prepare(configs: Sequence[DriveConfig], protocol: Protocol,

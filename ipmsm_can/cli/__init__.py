@@ -20,9 +20,13 @@ from ipmsm_can import __version__
 COMMANDS = {
     "demo": "a simulated drive and the companion on one bus, with a live status and a plot",
     "run": "the companion on a CAN bus",
+    "monitor": "everything of a drive on one screen, live or of a recording, with keys to record and to mark",
+    "record": "every frame of a CAN bus into a log, and a measurement file with the estimates",
     "drive": "the simulated drive on a CAN bus",
     "replay": "run the companion over a recorded log",
     "map": "maps of other inverters: list, show, check against a log",
+    "diagnose": "what is wrong with a drive, from a log or a live bus",
+    "identify": "the motor's parameters from a log, as a drive.toml",
     "bus": "health of a bus, live or recorded: load, losses, errors, clocks",
     "paper": "run the paper's experiments again, with a verdict on each claim",
     "campaign": "thousands of random runs: is an angle called valid ever wrong",
@@ -31,8 +35,9 @@ COMMANDS = {
 }
 """Commands and what they do, in the order of the help."""
 
-_MODULES = {"bus": "health"}
-"""Modules that are not named as their command is: `cli.bus` is what all commands on a bus share."""
+_MODULES = {"bus": "health", "monitor": "live_view"}
+"""Modules that are not named as their command is: `cli.bus` is what all commands on a bus share, and `cli.monitor`
+takes the status of any."""
 
 _DESCRIPTION = """\
 Rotor position of interior permanent magnet motors from sampled currents and voltages on CAN.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ipmsm_can.bus.health import BusHealth
     from ipmsm_can.bus.health_report import HealthReport
     from ipmsm_can.cli.status import HealthStatus
+    from ipmsm_can.logs import Mark
+    from ipmsm_can.record.status import RecordStatus
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -37,6 +39,7 @@ exit codes: 0 nothing grave, 1 a finding of severity "error", 2 bad input
 """
 _BITRATE, _DATA_BITRATE = 1_000_000, 5_000_000
 _BLOCK_FRAMES = 65536
+_MARKS_SHOWN = 50
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,21 +69,35 @@ def main(args: argparse.Namespace) -> int:
 
 
 def _recorded(args: argparse.Namespace) -> int:
-    from ipmsm_can.logs import read_log
+    from ipmsm_can.logs import gaps, read_log
 
     path = Path(args.log)
     reader = read_log(path, block_frames=_BLOCK_FRAMES, channel=getattr(args, "channel", None))
     # candump writes what SocketCAN said; other formats also hold error frames of other origin
     kind = [s.lower() for s in path.suffixes if s.lower() != ".gz"][-1:]
-    health = _health(args, error_classes=kind == [".log"])
+    health = build_health(args, error_classes=kind == [".log"])
     for block in reader:
         health.update(block)
+    found = gaps(reader.marks)
+    health.note_outages(len(found), sum(gap.seconds for gap in found), "")
     code = _tell(health.report(str(path)), args.json)
+    if reader.marks and not args.json:
+        print(_marked(reader.marks))
     if reader.problem or reader.bad_lines:
         told = reader.problem or f"{path} is damaged: {reader.bad_lines} of its lines cannot be read"
         print(f"ipmsm-can bus: {told}; what was readable is in the report", file=sys.stderr)
         return 2
     return code
+
+
+def _marked(marks: Sequence[Mark]) -> str:
+    """The remarks of a recording, by this computer's clock."""
+    import time
+
+    lines = [f"  {time.strftime('%H:%M:%S', time.localtime(1e-9 * mark.t_ns))}.{mark.t_ns // 10**6 % 1000:03d}  "
+             f"{mark.text}" for mark in marks[:_MARKS_SHOWN]]
+    more = len(marks) - len(lines)
+    return "\n".join(["marked in the recording:", *lines, *([f"  ... and {more} more"] if more else [])])
 
 
 def _live(args: argparse.Namespace) -> int:
@@ -91,11 +108,11 @@ def _live(args: argparse.Namespace) -> int:
     from ipmsm_can.cli.screen import Screen
 
     socketcan = bus_configuration(args)[0]["interface"] == "socketcan"
-    health = _health(args, error_classes=socketcan)
+    health = build_health(args, error_classes=socketcan)
     with (bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port,
           Link(port, lambda: bus.open_bus(args)) as link):
         listener = Listener(link, health, isinstance(port, SocketCanPort), not args.no_reconnect)
-        status = _status(listener.report)
+        status = health_status("ipmsm-can bus", listener.report)
         gone = ""
         with nullcontext() if args.quiet or args.json else Screen(status):
             try:
@@ -108,16 +125,19 @@ def _live(args: argparse.Namespace) -> int:
     return 1 if gone else code
 
 
-def _status(report: Callable[[], HealthReport]) -> Callable[[], HealthStatus]:
+def health_status(title: str, report: Callable[[], HealthReport],
+                  records: Callable[[], tuple[RecordStatus, ...]] = tuple) -> Callable[[], HealthStatus]:
+    """What takes the status of a listener, and of what it records."""
     import time
 
     from ipmsm_can.cli.status import HealthStatus
 
     begin = time.monotonic()
-    return lambda: HealthStatus("ipmsm-can bus", time.monotonic() - begin, report())
+    return lambda: HealthStatus(title, time.monotonic() - begin, report(), records())
 
 
-def _health(args: argparse.Namespace, error_classes: bool) -> BusHealth:
+def build_health(args: argparse.Namespace, error_classes: bool) -> BusHealth:
+    """A `BusHealth` with the bit rates and databases of the options, its kernels compiled."""
     from ipmsm_can.bus.health import BusHealth, warm_up
     from ipmsm_can.wire.protocol import Protocol
 

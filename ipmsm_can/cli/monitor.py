@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ipmsm_can.bus.live import LiveRunner
     from ipmsm_can.drive.node import Step
     from ipmsm_can.node import Node, Tracked
+    from ipmsm_can.record.status import RecordStatus
 
 _RATE_WINDOW_S = 1.0
 _QUANTILES_EVERY_S = 1.0
@@ -66,9 +67,11 @@ class RunMonitor:
     """Takes `RunStatus` from a runner: `observe` is the runner's observer, `status` may be called from
     another thread, a few times a second."""
 
-    def __init__(self, runner: LiveRunner, title: str = "ipmsm-can run") -> None:
+    def __init__(self, runner: LiveRunner, title: str = "ipmsm-can run",
+                 records: Callable[[], tuple[RecordStatus, ...]] = tuple) -> None:
         self.runner = runner
         self.title = title
+        self._records = records
         self.errors = ErrorCounters()
         self._begin = time.monotonic()
         self._errors_seen = 0
@@ -116,7 +119,7 @@ class RunMonitor:
         nodes = tuple(_node_status(node, rates[f"samples {number}"], rates[f"estimates {number}"],
                                    self._ever.get(number, 0))
                       for number, node in companion.nodes.items())
-        return RunStatus(self.title, now - self._begin, companion.transmit, bus, nodes)
+        return RunStatus(self.title, now - self._begin, companion.transmit, bus, nodes, self._records())
 
     def _no_bus(self) -> str:
         """Why there is no bus now: the interface is gone, or its controller has switched itself off."""

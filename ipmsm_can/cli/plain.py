@@ -6,6 +6,7 @@ import math
 
 from ipmsm_can.bus import health_words
 from ipmsm_can.cli.status import BusStatus, DriveStatus, HealthStatus, NodeStatus, RunStatus, Status
+from ipmsm_can.record.status import RecordStatus
 
 SILENT = "SILENT (listening only)"
 TRANSMITTING = "TRANSMITTING"
@@ -49,6 +50,11 @@ def bus_troubles(bus: BusStatus) -> list[tuple[str, int]]:
             ("kernel drops", bus.drops)]
 
 
+def recorded(records: tuple[RecordStatus, ...]) -> str:
+    """"REC run.blf 1.2 MB | ", or "" where nothing is recorded."""
+    return "".join(f"{record.words} | " for record in records)
+
+
 def line(status: Status) -> str:
     """One line."""
     if isinstance(status, HealthStatus):
@@ -61,9 +67,9 @@ def line(status: Status) -> str:
                 f"| {drives}")
     bus = status.bus
     if bus.no_bus:
-        return f"{clock(status.elapsed)} {voice(status)} {bus.no_bus}"
-    text = (f"{clock(status.elapsed)} {voice(status)} load {100 * bus.load:.1f} % {bus.frames_per_s:.0f} frames/s"
-            f" drops {bus.drops}")
+        return f"{clock(status.elapsed)} {voice(status)} {recorded(status.records)}{bus.no_bus}"
+    text = (f"{clock(status.elapsed)} {voice(status)} {recorded(status.records)}load {100 * bus.load:.1f} % "
+            f"{bus.frames_per_s:.0f} frames/s drops {bus.drops}")
     if bus.outages:
         text += f" outages {bus.outages}"
     if bus.error_frames:
@@ -81,7 +87,7 @@ def line(status: Status) -> str:
 def health_line(status: HealthStatus) -> str:
     """One line of a bus that is listened to."""
     r = status.report
-    begin = f"{clock(status.elapsed)} {SILENT} "
+    begin = f"{clock(status.elapsed)} {SILENT} {recorded(status.records)}"
     if r.no_bus:
         return begin + r.no_bus
     text = begin + f"load {100 * r.load:.1f} % frames {r.frames} ids {len(r.ids)}"

@@ -9,6 +9,7 @@ from rich.text import Text
 from ipmsm_can.cli import plain
 from ipmsm_can.cli.health_view import health_lines
 from ipmsm_can.cli.status import DriveStatus, HealthStatus, NodeStatus, RunStatus, Status
+from ipmsm_can.record.status import RecordStatus
 
 _BLOCK_LINES = 8
 _LABEL = 9
@@ -20,6 +21,7 @@ def render(status: Status, width: int, height: int) -> Text:
     if isinstance(status, HealthStatus):
         badge = Text(f" {plain.SILENT} ", style="reverse")
         lines = _header(status.title, badge, status.elapsed, status.report.source, width)
+        lines[2:2] = _records(status.records, width)
         lines += health_lines(status.report, width, height - len(lines))
     else:
         lines = _run(status, width, height) if isinstance(status, RunStatus) else _drive(status, width)
@@ -33,9 +35,10 @@ def render(status: Status, width: int, height: int) -> Text:
 def _run(status: RunStatus, width: int, height: int) -> list[Text]:
     badge = Text(f" {plain.voice(status)} ", style="bold black on yellow" if status.transmit else "reverse")
     lines = _header(status.title, badge, status.elapsed, status.bus.description, width)
+    lines[2:2] = _records(status.records, width)
     if status.bus.no_bus:
         told = textwrap.wrap(status.bus.no_bus, max(20, width - 2))
-        lines[2:] = [*(Text(f"  {part}", style="bold red") for part in told[:_ERROR_LINES]), Text()]
+        lines[-1:] = [*(Text(f"  {part}", style="bold red") for part in told[:_ERROR_LINES]), Text()]
     tail = _bus(status, width)
     room = height - len(lines) - len(tail)
     if _BLOCK_LINES * len(status.nodes) + sum(bool(n.encoder) for n in status.nodes) <= room:
@@ -65,6 +68,11 @@ def _header(title: str, badge: Text, elapsed: float, description: str, width: in
     second = Text(description, style="dim")
     second.append(end.rjust(max(len(end) + 2, width - second.cell_len)))
     return [first, second, Text()]
+
+
+def _records(records: tuple[RecordStatus, ...], width: int) -> list[Text]:
+    return [Text(part, style="bold green" if one.whole else "bold red")
+            for one in records for part in textwrap.wrap(one.words, width)]
 
 
 def _labelled(label: str, *parts: str | tuple[str, str] | Text) -> Text:

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from ipmsm_can.bus.replay import NodeSummary, Replay
     from ipmsm_can.bus.rows import RowBlock, RowFile
     from ipmsm_can.config import DriveConfig
+    from ipmsm_can.logs.marks import Mark
+    from ipmsm_can.record.measure import MeasureFile
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -39,12 +39,16 @@ columns of --out, one row per sample of the drive, filled ones included:
   excitation     smallest eigenvalue of the windowed integral of Phi Phi^T [V^2 s]
   lambda_alpha, lambda_beta   estimated stator flux linkage [Wb peak]
 
+--out run.mf4 is a measurement file instead (docs/record.md): decoded signals of the drives and the estimates, with
+units, for CANape, asammdf and other viewers of MDF; with several --drive one file for all.
+
 With several --drive, the node number is added to the name: --out run.csv gives run.node0.csv and so on.
 An existing file is replaced. After Ctrl-C everything replayed so far is in the file.
 
 examples:
   ipmsm-can replay run.blf --drive drive.toml
   ipmsm-can replay run.log.gz --drive drive.toml --out estimates.parquet
+  ipmsm-can replay run.blf --drive drive.toml --out run.mf4
   ipmsm-can replay both.asc --drive a.toml --drive b.toml --out estimates.csv
   ipmsm-can replay car.blf --drive drive.toml --map cascadia_pm
 
@@ -54,7 +58,7 @@ replayed, and one sentence says what was wrong
 
 _PROGRESS_S = 0.2
 _BLOCK_FRAMES = 65536
-_IDS_SHOWN = 12
+_MARKS_SHOWN = 20
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="LOG", help="the recorded log")
     parser.add_argument("--drive", action="append", required=True, metavar="drive.toml",
                         help="configuration of a drive in the log; may be given several times")
-    parser.add_argument("--out", metavar="FILE", help="write one row per sample to this .csv or .parquet file")
+    parser.add_argument("--out", metavar="FILE",
+                        help="one row per sample into this .csv or .parquet file, or all signals into this .mf4")
     parser.add_argument("--map", metavar="MAP", help="the log is of another inverter: a map, or the name of one "
                         "(docs/mapping.md, ipmsm-can map list)")
     parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
@@ -84,10 +89,12 @@ def main(args: argparse.Namespace) -> int:
 
     log = Path(args.log)
     configs = load_configs(args.drive)
-    paths = _row_paths(args.out, configs, [log, *map(Path, args.drive)])
+    inputs = [log, *map(Path, args.drive)]
+    measure = _measure_path(args.out, inputs)
+    paths = _row_paths(None if measure else args.out, configs, inputs)
     reader = read_log(log, block_frames=_BLOCK_FRAMES, channel=args.channel)
     protocol = build_protocol(configs)
-    session = Session(configs, protocol, paths)
+    session = Session(configs, protocol, paths, measure)
     _leave_on_sigterm()
     try:
         session.run(reader)
@@ -96,6 +103,8 @@ def main(args: argparse.Namespace) -> int:
               + (", which are written" if paths else ""), file=sys.stderr)
         raise
     print(session.report())
+    for line in _marked(reader.marks, session.begin_ns):
+        print(line)
     if reader.passed_over:
         print(f"{reader.passed_over} objects of the log hold no CAN frame and were passed over")
     absent = [c for c in configs if not session.replay.summaries[c.wire.node].rows]
@@ -116,6 +125,25 @@ def _leave_on_sigterm() -> None:
         signal.signal(signal.SIGTERM, leave)
     except ValueError:
         return  # not in the main thread: then somebody else looks after signals
+
+
+def _measure_path(out: str | None, inputs: Sequence[Path]) -> Path | None:
+    """The measurement file, if --out names one; raises ValueError where it cannot be written or is an input."""
+    if out is None or Path(out).suffix.lower() != ".mf4":
+        return None
+    from ipmsm_can.record.measure import check_measure_path
+
+    check_measure_path(out)
+    if any(Path(out).exists() and given.exists() and Path(out).samefile(given) for given in inputs):
+        raise ValueError(f"--out {out} is one of the input files; allowed is another file")
+    return Path(out)
+
+
+def _marked(marks: Sequence[Mark], begin_ns: int) -> list[str]:
+    """The remarks of a recording, with their time from its first frame."""
+    lines = [f"marked at {1e-9 * (mark.t_ns - begin_ns):.3f} s: {mark.text}" for mark in marks[:_MARKS_SHOWN]]
+    more = len(marks) - len(lines)
+    return [*lines, f"... and {more} more marks"] if more else lines
 
 
 def _row_paths(out: str | None, configs: Sequence[DriveConfig], inputs: Sequence[Path]) -> dict[int, Path]:
@@ -144,8 +172,13 @@ class Session:
     Neither holds the loading of compiled kernels, or their compilation on the first run ever.
     """
 
-    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, paths: dict[int, Path]) -> None:
+    def __init__(self, configs: Sequence[DriveConfig], protocol: Protocol, paths: dict[int, Path],
+                 measure: Path | None = None) -> None:
         self.replay: Replay
+        self.begin_ns = 0
+        """Time of the first frame [ns]."""
+        self._measure_path = measure
+        self._measure: MeasureFile | None = None
         self.files: dict[int, RowFile] = {}
         self.compute_s = 0.0
         self.read_s = 0.0
@@ -170,7 +203,12 @@ class Session:
         warm_up()
         begin = time.monotonic()
         configs, source = prepare(self._configs, self._protocol, blocks)
-        self.replay = Replay(configs, self._protocol, self._write if self._paths else None)
+        if self._measure_path is not None:
+            from ipmsm_can.record.measure import MeasureFile
+
+            self._measure = MeasureFile(self._measure_path, [c.wire.node for c in configs], self._protocol)
+        self.replay = Replay(configs, self._protocol, self._write if self._paths else None,
+                             self._measure.feed if self._measure else None)
         self.read_s += time.monotonic() - begin
         try:
             while True:
@@ -179,6 +217,7 @@ class Session:
                 self.read_s += time.monotonic() - begin
                 if block is None:
                     break
+                self.begin_ns = self.begin_ns or (int(block.t_ns[0]) if len(block) else 0)
                 begin = time.monotonic()
                 self.replay.feed(block)
                 self.compute_s += time.monotonic() - begin
@@ -187,6 +226,10 @@ class Session:
             begin = time.monotonic()
             for file in self.files.values():
                 file.close()
+            if self._measure is not None:
+                for mark in getattr(blocks, "marks", ()):
+                    self._measure.mark(mark)
+                self._measure.close()
             self.compute_s += time.monotonic() - begin
             if self._progress:
                 print("\r\x1b[K", end="", file=sys.stderr, flush=True)
@@ -220,6 +263,7 @@ class Session:
                          f"({self.rows / self.compute_s:.3g} samples/s); "
                          f"reading the log took another {self.read_s:.2f} s")
         lines += [f"wrote {file.path}" for file in self.files.values()]
+        lines += [f"wrote {self._measure.path}"] if self._measure is not None else []
         return "\n".join(lines)
 
 
@@ -259,29 +303,8 @@ def _share(part: int, whole: int) -> str:
 
 def _absence(config: DriveConfig, replay: Replay, protocol: Protocol, log: Path, channel: str | None) -> str:
     """Why there is not one row of this drive, in one sentence."""
-    from ipmsm_can.wire.protocol import MessageKind
+    from ipmsm_can.bus.absence import absence
 
-    number = config.wire.node
-    came = replay.sample_frames(number)
-    node = replay.companion.nodes[number]
-    if came and node.receiver.sequencer.waiting:
-        return (f"{log} holds {came} sample frames of node {number} but no DriveTiming, so their rate is unknown; "
-                "set wire.sample_rate in the drive's TOML file")
-    if came:
-        return (f"none of the {came} sample frames of node {number} in {log} could be used "
-                f"({node.bad_frames} bad)")
-    ids = " and ".join(f"0x{protocol.base_ids[kind] + number:X}"
-                       for kind in (MessageKind.DRIVE_SAMPLE, MessageKind.DRIVE_SAMPLE_BLOCK))
-    if channel is not None and not (replay.standard_ids.any() or replay.extended_ids):
-        return f"{log} holds no frame of channel {channel!r}; without --channel those of every channel are taken"
-    where = "" if channel is None else f" on channel {channel!r}"
-    return (f"{log} holds no sample frame of node {number}{where} (identifiers {ids}); "
-            f"seen were {_ids_seen(replay.standard_ids, replay.extended_ids)}")
-
-
-def _ids_seen(standard: np.ndarray[Any, np.dtype[np.int64]], extended: set[int]) -> str:
-    names = [f"0x{k:X}" for k in standard.nonzero()[0].tolist()] + [f"0x{k:08X}" for k in sorted(extended)]
-    if not names:
-        return "no identifiers at all"
-    more = f" and {len(names) - _IDS_SHOWN} more" if len(names) > _IDS_SHOWN else ""
-    return ", ".join(names[:_IDS_SHOWN]) + more
+    node = replay.companion.nodes[config.wire.node]
+    waiting = node.receiver.sequencer.waiting
+    return absence(node.number, replay.seen, protocol, waiting, node.bad_frames, log, channel)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ipmsm_can.cli import bus
+from ipmsm_can.cli import bus, recording
 
 if TYPE_CHECKING:
-    from ipmsm_can.node import Node
+    from ipmsm_can.frames import FrameBlock
+    from ipmsm_can.node import Node, Tracked
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -21,11 +23,14 @@ examples:
   ipmsm-can run drive.toml -i socketcan -c can0               listen
   ipmsm-can run drive.toml -i socketcan -c can0 --transmit    answer: position, status, probing commands
   ipmsm-can run left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000 --duration 60
+  ipmsm-can run drive.toml -i socketcan -c can0 --record run.blf --measure run.mf4
+  ipmsm-can run drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm
   CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
 
 On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.
 A bus that goes away (interface down, adapter unplugged) is waited for; --no-reconnect ends the run instead.
-exit codes: 0 ended by you or by --duration, 1 there was no bus at the end or a drive sent no samples, 2 bad input
+exit codes: 0 ended by you or by --duration; 1 there was no bus at the end, a drive sent no samples, or a recording
+is not whole; 2 bad input
 """
 
 
@@ -34,19 +39,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("configs", nargs="+", metavar="drive.toml", help="configuration of a drive, one file each")
     parser.add_argument("--transmit", action="store_true",
                         help="send estimates, status and injection commands; without it nothing is ever sent")
+    parser.add_argument("--map", metavar="MAP", help="the drive is another inverter: a map, or the name of one "
+                        "(docs/mapping.md, ipmsm-can map list); it is only listened to")
+    parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
     parser.add_argument("--duration", type=bus.seconds, metavar="S", help="end after so many seconds")
     parser.add_argument("--quiet", action="store_true", help="no status while it runs, only the summary")
     parser.add_argument("--no-reconnect", action="store_true", help="end when the bus goes away")
+    recording.add_arguments(parser)
     bus.add_arguments(parser)
 
 
 def main(args: argparse.Namespace) -> int:
     """Run the companion until it is told to end; returns the exit code."""
+    if args.map is not None:
+        from ipmsm_can.cli.mapped_run import run_mapped
+
+        return run_mapped(args)
+    if args.node is not None:
+        raise ValueError("--node goes with --map; without a map the drive.toml has wire.node")
     from ipmsm_can.config import load_configs
 
     configs = load_configs(args.configs)
     rates = bus.bit_rates(args, configs)
     bus.check_named(args)
+    recording.check(args)
 
     from ipmsm_can.bus.link import Link
     from ipmsm_can.bus.live import LiveRunner
@@ -59,11 +75,18 @@ def main(args: argparse.Namespace) -> int:
     with bus.patience():
         warm_up_companion(configs, protocol)
     with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port, \
-            Link(port, lambda: bus.open_bus(args)) as link:
+            Link(port, lambda: bus.open_bus(args)) as link, \
+            recording.recordings(args, link, configs, protocol) as tap:
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
                             None if args.no_reconnect else link)
-        monitor = RunMonitor(runner)
-        code, status = bus.serve("run", lambda: runner.run(stop, monitor.observe), monitor.status, args.quiet)
+        monitor = RunMonitor(runner, records=tap.status)
+
+        def observe(block: FrameBlock, tracked: Sequence[Tracked], sent: FrameBlock, now_ns: int) -> None:
+            monitor.observe(block, tracked, sent, now_ns)
+            tap.observe(block, tracked, sent, now_ns)
+
+        code, status = bus.serve("run", lambda: runner.run(stop, observe), monitor.status, args.quiet)
+    code = max(code, recording.code_of(tap))
     if link.down:
         print(f"ipmsm-can run: there is {link.words}", file=sys.stderr)
         code = 1

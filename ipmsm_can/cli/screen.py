@@ -20,14 +20,15 @@ import sys
 import threading
 from collections.abc import Callable
 from types import TracebackType
-from typing import IO, Self
+from typing import IO, Any, Generic, Self, TypeVar
 
 from ipmsm_can.cli import plain
-from ipmsm_can.cli.status import Status
 
 REFRESH_S = 0.2
 LINE_S = 1.0
 _PATIENCE_S = 2.0
+
+S = TypeVar("S")
 
 
 def is_terminal(out: IO[str]) -> bool:
@@ -35,15 +36,21 @@ def is_terminal(out: IO[str]) -> bool:
     return out.isatty() and os.environ.get("TERM", "") not in ("dumb", "unknown")
 
 
-class Screen:
+class Screen(Generic[S]):
     """Shows what `take` gives until the `with` block ends.
 
     take: called from a thread of this object.  live: a picture (True) or plain lines (False); None decides
     by what standard output is.
+    drawer: module that is the drawing process of what `take` gives.  line: that as a plain line.  news: set by
+    whoever wants it shown at once.
     """
 
-    def __init__(self, take: Callable[[], Status], live: bool | None = None) -> None:
+    def __init__(self, take: Callable[[], S], live: bool | None = None, *, drawer: str = "ipmsm_can.cli.screen",
+                 line: Callable[[Any], str] = plain.line, news: threading.Event | None = None) -> None:
         self._take = take
+        self._drawer = drawer
+        self._line = line
+        self._news = threading.Event() if news is None else news
         self._live = is_terminal(sys.stdout) if live is None else live
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._work, name="screen", daemon=True)
@@ -51,14 +58,15 @@ class Screen:
 
     def __enter__(self) -> Self:
         if self._live:
-            self._child = subprocess.Popen([sys.executable, "-m", "ipmsm_can.cli.screen"],
-                                           stdin=subprocess.PIPE, env=_environment())
+            self._child = subprocess.Popen([sys.executable, "-m", self._drawer],
+                                           stdin=subprocess.PIPE, env=environment())
         self._thread.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None,
                  trace: TracebackType | None) -> None:
         self._end.set()
+        self._news.set()
         self._thread.join(_PATIENCE_S)
         child = self._child
         if child is None or child.stdin is None:
@@ -78,11 +86,13 @@ class Screen:
         if self._child is not None and self._child.stdin is not None:
             self._draw(self._child.stdin)
         while not self._end.wait(LINE_S):
-            print(plain.line(self._take()), flush=True)
+            print(self._line(self._take()), flush=True)
 
     def _draw(self, pipe: IO[bytes]) -> None:
         """Feed the drawing process; returns at the end, or when that process is gone."""
-        while not self._end.wait(REFRESH_S):
+        while not self._end.is_set():
+            self._news.wait(REFRESH_S)
+            self._news.clear()
             try:
                 pipe.write(pickle.dumps(self._take()))
                 pipe.flush()
@@ -90,8 +100,8 @@ class Screen:
                 return
 
 
-def _environment() -> dict[str, str]:
-    """Ours, with the package's home in the path: the program may have been started in another folder."""
+def environment() -> dict[str, str]:
+    """For a process of ours, with the package's home in the path: this one may have been started in any folder."""
     home = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
     path = os.environ.get("PYTHONPATH")
     return {**os.environ, "PYTHONPATH": f"{home}{os.pathsep}{path}" if path else home}

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from ipmsm_can.bus.health_report import HealthReport
+from ipmsm_can.record.status import RecordStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +118,14 @@ class BusStatus:
 
 @dataclass(frozen=True, slots=True)
 class RunStatus:
-    """Companion on a bus.  elapsed [s]; transmit: it may send."""
+    """Companion on a bus.  elapsed [s]; transmit: it may send.  records: what is recorded meanwhile."""
 
     title: str
     elapsed: float
     transmit: bool
     bus: BusStatus
     nodes: tuple[NodeStatus, ...]
+    records: tuple[RecordStatus, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +168,12 @@ class DriveStatus:
 
 @dataclass(frozen=True, slots=True)
 class HealthStatus:
-    """A bus that is listened to.  elapsed [s]."""
+    """A bus that is listened to.  elapsed [s].  records: what is recorded meanwhile."""
 
     title: str
     elapsed: float
     report: HealthReport
+    records: tuple[RecordStatus, ...] = ()
 
 
 Status = RunStatus | DriveStatus | HealthStatus

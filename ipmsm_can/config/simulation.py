@@ -60,6 +60,9 @@ class SimulationConfig(Section):
     current_offset: Annotated[tuple[float, float], Quantity(
         doc="Offset of the current sensors (alpha, beta).", unit=units.AMPERE,
         count=2)] = DriveParameters.current_offset
+    current_gain: Annotated[tuple[float, float, float], Quantity(
+        doc="Gain of the current sensors of the phases (a, b, c), which the control suffers from, too; 1 where "
+            "they are right.", above=0, most=10, count=3)] = DriveParameters.current_gain
     adc_step: Annotated[float, Quantity(
         doc="Resolution of the current samples; 0 = no steps.", unit=units.AMPERE,
         least=0)] = DriveParameters.adc_step

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ipmsm_can._jit import kernel
 
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
@@ -48,6 +51,14 @@ def dead_time_error(
     s_b = soft_sign(i_b / zone)
     s_c = soft_sign(i_c / zone)
     return -voltage * (2.0 * s_a - s_b - s_c) / 3.0, -voltage * (s_b - s_c) * _HALF_SQRT3 / 1.5
+
+
+def sensor_gain(gains: tuple[float, float, float]) -> NDArray[np.float64]:
+    """What sensors of these gains in the phases a, b, c make of the current: float64 (4,), the matrix from
+    (alpha, beta) to (alpha, beta) by rows; with equal gains it is that gain and no cross term."""
+    a, b, c = gains
+    cross = (c - b) / (4.0 * _HALF_SQRT3)
+    return np.array([a - (2.0 * a - b - c) / 6.0, cross, cross, 0.5 * (b + c)])
 
 
 @kernel

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ipmsm_can.drive.angle_source import AngleState
 from ipmsm_can.drive.estimates import EstimateReceiver
+from ipmsm_can.drive.faults import DriveFaults, FaultyEncoder
 from ipmsm_can.drive.parameters import DriveNodeSettings as DriveNodeSettings
 from ipmsm_can.drive.simulation import DriveSamples, DriveSimulation
 from ipmsm_can.frames import FrameBlock
@@ -52,11 +53,13 @@ class DriveNode:
 
     A command is obeyed only if its CRC is right, its counter moved on, and it can be executed; every other
     one is counted in `rejected`, and the one in force runs out by its time to live.
+    faults: what it reports wrongly.
     """
 
     def __init__(self, protocol: Protocol, node: int, simulation: DriveSimulation,
-                 settings: DriveNodeSettings) -> None:
+                 settings: DriveNodeSettings, faults: DriveFaults | None = None) -> None:
         self.node = node
+        self._faults = faults
         self.simulation = simulation
         self.settings = settings
         self.rejected = 0
@@ -69,6 +72,8 @@ class DriveNode:
         p = simulation.parameters
         self._rate = p.sample_rate
         self.estimates = EstimateReceiver(protocol, node, p.estimate_max_age, p.angle_sigma_limit)
+        self._faulty_encoder = None if faults is None else FaultyEncoder(
+            faults, simulation.motor.pole_pairs, p.sample_rate)
         self._needs_companion = p.angle_source != "encoder"
         self._encoder_fails = p.encoder_fails_sample
         self._last_state = math.nan
@@ -115,6 +120,8 @@ class DriveNode:
             self.waveform = Waveform(int(s.injection_waveform[-1]))
         parts: list[tuple[NDArray[np.int64], NDArray[np.uint8]]] = []
         samples = np.array([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+        if self._faults is not None:
+            samples = self._faults.samples(samples)
         parts.append(self._blocks(samples, first) if self.settings.fd else self._singles(samples, s.sample))
         parts += [self._timing(s), self._status(s), self._reference(s)]
         at = np.concatenate([p[0] for p in parts])
@@ -199,10 +206,13 @@ class DriveNode:
     def _reference(self, s: DriveSamples) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         due = self._due(s, self.settings.reference_rate)
         due = due[s.sample[due] < self._encoder_fails]
-        theta_e = self.encoder(s.theta_e[due])
+        theta, omega = s.theta_e, s.omega_e
+        if self._faulty_encoder is not None:
+            theta, omega = self._faulty_encoder.read(s.sample, theta, omega)
+        theta_e = self.encoder(theta[due])
         return s.sample[due], self._protocol.encode(MessageKind.DRIVE_REFERENCE, self.node, {
             "theta_e": self._protocol.angle(MessageKind.DRIVE_REFERENCE, "theta_e", theta_e),
-            "omega_e": s.omega_e[due], "sample_counter": s.sample[due] & 0xFFFFFFFF})
+            "omega_e": omega[due], "sample_counter": s.sample[due] & 0xFFFFFFFF})
 
     def encoder(self, theta_e: NDArray[np.float64]) -> NDArray[np.float64]:
         """The angle [rad electrical] as the encoder tells it."""

@@ -40,6 +40,7 @@ class DriveParameters:
     dead_time_zone: current below which that loss fades out [A], > 0.
     current_noise: standard deviation of the sensor noise per axis (alpha, beta) [A], >= 0.
     current_offset: sensor offset (alpha, beta) [A].
+    current_gain: gain of the current sensors of the phases a, b, c, above 0; 1 where they are right.
     adc_step: resolution of the current samples [A], 0 for none.
     voltage_delay: how late the reported voltage is [samples], -1..4: the mean over the interval that ended so
         much before the voltage's last step; 0 is the convention of the wire, -1 the voltage just begun.
@@ -77,6 +78,7 @@ class DriveParameters:
     dead_time_zone: float = 0.2
     current_noise: float = 0.02
     current_offset: tuple[float, float] = (0.0, 0.0)
+    current_gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
     adc_step: float = 0.0
     voltage_delay: float = 0.0
     sampling_lead: float = 0.0
@@ -119,6 +121,8 @@ class DriveParameters:
         if len(self.current_offset) != 2 or not all(map(math.isfinite, self.current_offset)):
             raise ValueError(f"current_offset is {self.current_offset!r}; "
                              "allowed are two finite numbers, in A")
+        if len(self.current_gain) != 3 or not all(math.isfinite(gain) and gain > 0.0 for gain in self.current_gain):
+            raise ValueError(f"current_gain is {self.current_gain!r}; allowed are three finite numbers above 0")
         _within("voltage_delay", self.voltage_delay, -1.0, LATEST_VOLTAGE, "samples")
         if not 0.0 <= self.sampling_lead < 1.0:
             raise ValueError(f"sampling_lead is {self.sampling_lead!r}; allowed is 0 to below 1 sample")
@@ -153,7 +157,8 @@ class DriveParameters:
 
     def noise_free(self) -> DriveParameters:
         """The same drive with perfect current sensors."""
-        return replace(self, current_noise=0.0, current_offset=(0.0, 0.0), adc_step=0.0)
+        return replace(self, current_noise=0.0, current_offset=(0.0, 0.0),
+                       current_gain=(1.0, 1.0, 1.0), adc_step=0.0)
 
     def torque_max(self, motor: Motor) -> float:
         """Largest torque reference [N m]: the torque limit, or what i_max gives if that is less."""

@@ -50,7 +50,7 @@ from ipmsm_can.drive.angle_source import (
 )
 from ipmsm_can.drive.control import current_step, regulate_current, speed_step
 from ipmsm_can.drive.estimates import Estimate
-from ipmsm_can.drive.inverter import measure_current
+from ipmsm_can.drive.inverter import measure_current, sensor_gain
 from ipmsm_can.drive.machine import (
     M_L_Q,
     M_POLE_PAIRS,
@@ -87,7 +87,8 @@ D_INJECTION_RAMP = 11  # V/s
 D_VOLTAGE_DELAY = 12  # samples
 D_SAMPLING_LEAD = 13  # samples
 D_BRAKE = 14
-D_SIZE = 15
+D_GAIN = 15  # of the current sensors: four numbers, see inverter.sensor_gain
+D_SIZE = 19
 
 # Voltage state, float64 (V_SIZE,): (alpha, beta) of the interval that ended, then of the one that begins, and of
 # those before the one that ended, latest first
@@ -219,9 +220,11 @@ def _simulate(
         cos_k = math.cos(theta_e)
         sin_k = math.sin(theta_e)
         i_d = cos_k * i_alpha + sin_k * i_beta
-        measured_alpha = measure_current(i_alpha, d[D_CURRENT_NOISE] * noise[j, 0], d[D_OFFSET_ALPHA],
+        seen_alpha = d[D_GAIN] * i_alpha + d[D_GAIN + 1] * i_beta
+        seen_beta = d[D_GAIN + 2] * i_alpha + d[D_GAIN + 3] * i_beta
+        measured_alpha = measure_current(seen_alpha, d[D_CURRENT_NOISE] * noise[j, 0], d[D_OFFSET_ALPHA],
                                          d[D_ADC_STEP])
-        measured_beta = measure_current(i_beta, d[D_CURRENT_NOISE] * noise[j, 1], d[D_OFFSET_BETA],
+        measured_beta = measure_current(seen_beta, d[D_CURRENT_NOISE] * noise[j, 1], d[D_OFFSET_BETA],
                                         d[D_ADC_STEP])
         out[0, j] = measured_alpha
         out[1, j] = measured_beta
@@ -311,6 +314,7 @@ class DriveSimulation:
             period, p.substeps, not (p.speed_imposed or p.rotor_locked), p.rotor_locked,
             p.dead_time_voltage, p.dead_time_zone, p.current_noise, *p.current_offset, p.adc_step,
             p.injection_limit, p.injection_ramp, p.voltage_delay, p.sampling_lead, p.brake,
+            *sensor_gain(p.current_gain),
         ], dtype=np.float64)
         self._speed_track, self._load_track = profile.tracks(p.sample_rate)
         at_rest = p.rotor_locked or (p.brake and not p.speed_imposed and p.angle_source == "companion")

@@ -6,8 +6,9 @@
 BLF, candump's text and MF4 are read into arrays without a Python object per frame; python-can reads the others.
 """
 
+from ipmsm_can.logs.marks import Gap, Mark, gaps
 from ipmsm_can.logs.reader import LogReader, read_log
 from ipmsm_can.logs.source import LogError
 from ipmsm_can.logs.writer import LogWriter, write_log
 
-__all__ = ["LogError", "LogReader", "LogWriter", "read_log", "write_log"]
+__all__ = ["Gap", "LogError", "LogReader", "LogWriter", "Mark", "gaps", "read_log", "write_log"]

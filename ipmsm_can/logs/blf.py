@@ -24,15 +24,23 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs import blf_kernel as k
+from ipmsm_can.logs import marks
+from ipmsm_can.logs.marks import Mark
 from ipmsm_can.logs.source import CHUNK_BYTES, Filling, LogError, Outcome, Request, Source
 
 _FILE = struct.Struct("<4sL8BQQLL8H8H")
 _FILE_BYTES = 144
 _BASE = struct.Struct("<4sHHLL")
 _CONTAINER = struct.Struct("<H6xL4x")
+_OBJECT = struct.Struct("<4sHHLLLHHQ")
+_MARKER = struct.Struct("<LLL3xBLLL12x")
+"""Of a global marker: event it belongs to, two colours, whether it may be moved, and the lengths of three texts:
+group, name, description.  As in python-can's can/io/blf.py."""
+_GROUP = "ipmsm_can"
 _STORED, _DEFLATED = 0, 2
 _CONTAINER_BYTES = 1 << 17
 _LARGEST_UNPACKED = 1 << 28
@@ -63,6 +71,8 @@ def read_blf(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
                     at, filling.rows = k.walk(view, at, start_ns, channel, block.raw, block.t_ns, filling.rows,
                                               counts)
                     outcome.passed_over = int(counts[k.PASSED_OVER])
+                    if counts[k.MARKERS]:
+                        _note_markers(data, start_ns, counts, outcome)
                     if not filling.full:
                         break
                     outcome.done = done
@@ -186,6 +196,22 @@ def _unpack(group: list[tuple[int, int, bytes]]) -> tuple[bytes, str]:
     return b"".join(parts), trouble
 
 
+def _note_markers(data: bytes, start_ns: int, counts: NDArray[np.int64], outcome: Outcome) -> None:
+    """Take in the global markers that `walk` came by."""
+    places = counts[k.FIRST_MARKER:k.FIRST_MARKER + counts[k.MARKERS]].tolist()
+    counts[k.MARKERS] = 0
+    for at in places:
+        _, header, _, size, _, unit, _, _, ticks = _OBJECT.unpack_from(data, at)
+        body = data[at + header:at + size]
+        texts, begin = [], _MARKER.size
+        for length in _MARKER.unpack_from(body)[4:]:
+            texts.append(body[begin:begin + length].split(b"\0")[0].decode("cp1252", "replace"))
+            begin += length
+        words = texts[1] if texts[0] == _GROUP else " - ".join(t for t in texts if t)
+        t_ns = min(start_ns + ticks * (10_000 if unit == 1 else 1), (1 << 63) - 1)
+        marks.note(outcome.marks, [Mark(t_ns, marks.one_line(words))])
+
+
 def _judge_end(source: Source, request: Request, promised: int, rest: bytes, outcome: Outcome) -> None:
     """A file may end too early without a container that is cut in two."""
     if source.problem:
@@ -220,15 +246,31 @@ class BlfWriter:
         """Append the frames of a block."""
         if not len(block):
             return
-        if self._start_ns is None:
-            first = int(block.t_ns[0])
-            self._start_ns = first // 1_000_000 * 1_000_000 if first >= _EARLIEST_S * 10**9 else 0
+        start_ns = self._begin(int(block.t_ns[0]))
         out = np.zeros(len(block) * k.OBJECT_BYTES, np.uint8)
-        size = k.lay_out(np.ascontiguousarray(block.raw), np.ascontiguousarray(block.t_ns), self._start_ns,
+        size = k.lay_out(np.ascontiguousarray(block.raw), np.ascontiguousarray(block.t_ns), start_ns,
                          self._channel, out)
-        self._waiting += out[:size].data
-        self._objects += len(block)
-        self._stop_ns = int(block.t_ns[-1])
+        self._take(bytes(out[:size].data), len(block), int(block.t_ns[-1]))
+
+    def mark(self, mark: Mark) -> None:
+        """A remark, as a global marker."""
+        start_ns = self._begin(mark.t_ns)
+        group, name = _GROUP.encode(), marks.one_line(mark.text).encode("cp1252", "replace")
+        body = _MARKER.pack(0, 0xFFFFFF, 0xFF3300, 0, len(group), len(name), 0) + group + name
+        head = _OBJECT.pack(b"LOBJ", _OBJECT.size, 1, _OBJECT.size + len(body), k.GLOBAL_MARKER, 2, 0, 0,
+                            max(0, mark.t_ns - start_ns))
+        self._take(head + body + bytes(len(body) % 4), 1, mark.t_ns)
+
+    def _begin(self, t_ns: int) -> int:
+        """Time stamp 0 of the file [ns]; t_ns: of the first that is written."""
+        if self._start_ns is None:
+            self._start_ns = t_ns // 1_000_000 * 1_000_000 if t_ns >= _EARLIEST_S * 10**9 else 0
+        return self._start_ns
+
+    def _take(self, objects: bytes, count: int, stop_ns: int) -> None:
+        self._waiting += objects
+        self._objects += count
+        self._stop_ns = stop_ns
         whole = len(self._waiting) // _CONTAINER_BYTES * _CONTAINER_BYTES
         for at in range(0, whole, _CONTAINER_BYTES):
             self._write_container(bytes(self._waiting[at:at + _CONTAINER_BYTES]))

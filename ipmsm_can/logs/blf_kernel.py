@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
+from ipmsm_can.frames import SENT
 
 CAN_MESSAGE = 1
 CAN_ERROR = 2
@@ -20,13 +21,17 @@ CAN_OVERLOAD = 3
 LOG_CONTAINER = 10
 CAN_ERROR_EXT = 73
 CAN_MESSAGE2 = 86
+GLOBAL_MARKER = 96
 CAN_FD_MESSAGE = 100
 CAN_FD_MESSAGE_64 = 101
 CAN_FD_ERROR_64 = 104
 
-FRAMES, PASSED_OVER, BROKEN = 0, 1, 2
-COUNTS = 3
-"""Counters of `walk`: frames of every channel, objects without a frame, 1 once the order of objects is lost."""
+FRAMES, PASSED_OVER, BROKEN, MARKERS, FIRST_MARKER = 0, 1, 2, 3, 4
+MARKERS_KEPT = 256
+COUNTS = FIRST_MARKER + MARKERS_KEPT
+"""Counters of `walk`: frames of every channel, objects without a frame, 1 once the order of objects is lost; how
+many global markers are in `data`, and where the first MARKERS_KEPT of them begin; the caller sets their
+count back."""
 
 ALL_CHANNELS = -1
 
@@ -35,6 +40,7 @@ LARGEST_OBJECT = 1 << 26
 
 _BASE = 16
 _HEADER = 32
+_MARKER = 40
 _TEN_MICROSECONDS = 1
 _LAST_NS = (1 << 63) - 1
 _LOBJ = int.from_bytes(b"LOBJ", "little")
@@ -195,6 +201,10 @@ def walk(data: Bytes, start: int, start_ns: int, channel: int, raw: Bytes, t_ns:
         found = -1
         if (version == 1 or version == 2) and header >= _HEADER and body <= end:
             found = _channel(data, body, end, kind)
+            if kind == GLOBAL_MARKER and end - body >= _MARKER and counts[MARKERS] < MARKERS_KEPT:
+                counts[FIRST_MARKER + counts[MARKERS]] = begin
+                counts[MARKERS] += 1
+                continue
         if found < 0:
             counts[PASSED_OVER] += 1
             continue
@@ -255,7 +265,7 @@ def lay_out(raw: Bytes, t_ns: Ints, start_ns: int, channel: int, out: Bytes) -> 
             out[body + 10] = length
             _put(out, body + 16, stored, 4)
         else:
-            out[body + 2] = 0x80 if remote else 0
+            out[body + 2] = (0x80 if remote else 0) | (raw[row, 6] & SENT)  # bit 0: transmitted
             out[body + 3] = dlc
             _put(out, body + 4, stored, 4)
             if is_fd:

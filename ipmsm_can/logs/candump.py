@@ -5,6 +5,7 @@
     (1700000000.000000) can0 123##1AABB                  CAN FD, one digit of flags
 
 The fraction may have any number of digits; what follows the payload (R or T, a raw DLC) is passed over.
+Lines that begin with '#' are comments, as for can-utils; `marks` are among them.
 Time stamps stay exact and error frames keep their details; through python-can's messages both would be lost.
 """
 
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.frames import FrameBlock
+from ipmsm_can.frames import SENT, FrameBlock
+from ipmsm_can.logs import marks
 from ipmsm_can.logs.source import CHUNK_BYTES, Filling, LogError, Outcome, Request, Source
 
 _LONGEST_LINE = 1 << 12
@@ -30,6 +32,8 @@ def read_candump(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
     with Source(request.path, request.packed) as source:
         for text in _texts(source, counts):
             characters, at = np.frombuffer(text, np.uint8), 0
+            if text.startswith(b"#") or b"\n#" in text:
+                marks.note(outcome.marks, marks.from_comments(text))
             while at < len(characters):
                 block = filling.block
                 at, filling.rows = parse(characters, at, channel, block.raw, block.t_ns, filling.rows, counts)
@@ -124,7 +128,7 @@ def _parse_line(text: NDArray[np.uint8], at: int, end: int, channel: NDArray[np.
     """
     while at < end and text[at] <= 32:
         at += 1
-    if at == end:
+    if at == end or text[at] == 35:  # '#': a comment
         return 0, 0
     if text[at] != 40:  # '('
         return -1, 0
@@ -226,7 +230,7 @@ def _digits(value: int, base: int, width: int, out: NDArray[np.uint8], at: int) 
 @kernel
 def format_rows(raw: NDArray[np.uint8], t_ns: NDArray[np.int64], channel: NDArray[np.uint8],
             out: NDArray[np.uint8]) -> int:
-    """Lines as candump -L writes them; returns how many bytes."""
+    """Lines as candump -L writes them, with " T" behind a frame that was SENT; returns how many bytes."""
     at = 0
     for row in range(raw.shape[0]):
         micro = max(t_ns[row], 0) // 1000
@@ -266,6 +270,10 @@ def format_rows(raw: NDArray[np.uint8], t_ns: NDArray[np.int64], channel: NDArra
         else:
             for k in range(length):
                 at = _digits(raw[row, 8 + k], 16, 2, out, at)
+        if raw[row, 6] & SENT:
+            out[at] = 32
+            out[at + 1] = 84
+            at += 2
         out[at] = 10
         at += 1
     return at

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from ipmsm_can.bus.pythoncan import block_from_messages
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs.marks import from_comments, note
 from ipmsm_can.logs.source import LogError, Outcome, Request, Source, unpacked_file, words_of
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def read_other(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
         outcome.done = 1.0
         return
     with Source(request.path, request.packed) as source:
-        lines = _WholeLines(source)
+        lines = _WholeLines(source, outcome)
         yield from _blocks(lambda: _asc_reader(lines) if request.kind == ".asc" else reader(lines), request,
                            outcome, source)
         if lines.rest:
@@ -90,16 +91,20 @@ def _blocks(opening: Any, request: Request, outcome: Outcome, source: Source | N
 class _WholeLines(io.TextIOWrapper):
     """The lines of a text that have an end: half a line of python-can's formats reads like a shorter frame.
 
-    rest: a last line without an end, "" if there is none.  open_block: an ASC file's block was begun, not ended.
+    Remarks among them go to the outcome.  rest: a last line without an end, "" if there is none.
+    open_block: an ASC file's block was begun, not ended.
     """
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, outcome: Outcome) -> None:
         super().__init__(cast("io.BufferedReader", source.stream), encoding="utf-8", errors="replace")
         self.rest = ""
         self.open_block = False
+        self._outcome = outcome
 
     def __next__(self) -> str:  # type: ignore[override]  # typeshed has it yield bytes here
         line = super().__next__()
+        if line[0] in "/;":
+            note(self._outcome.marks, from_comments(line.encode()))
         if line[0] in "BEbe":
             words = line.lower().split(maxsplit=2)[:2]
             self.open_block = words == ["begin", "triggerblock"] or (

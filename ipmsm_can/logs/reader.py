@@ -10,6 +10,7 @@ from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs import blf_kernel, candump
 from ipmsm_can.logs.blf import read_blf
 from ipmsm_can.logs.candump import read_candump
+from ipmsm_can.logs.marks import Mark, beside, from_comments, note
 from ipmsm_can.logs.mf4 import read_mf4
 from ipmsm_can.logs.others import check_kind, read_other
 from ipmsm_can.logs.source import LogError, Outcome, Request
@@ -39,6 +40,8 @@ class LogReader:
         if kind in _WARM_UP:
             _WARM_UP[kind]()
         self._outcome = Outcome()
+        if beside(self.path).is_file():
+            note(self._outcome.marks, from_comments(beside(self.path).read_bytes()))
         self._blocks = self._guarded(_OWN.get(kind, read_other)(request, self._outcome))
 
     def _guarded(self, blocks: Iterator[FrameBlock]) -> Iterator[FrameBlock]:
@@ -62,8 +65,13 @@ class LogReader:
 
     @property
     def passed_over(self) -> int:
-        """Objects of a BLF file so far that hold no CAN frame: markers, statistics, frames of other buses."""
+        """Objects of a BLF file so far that hold no CAN frame: statistics, frames of other buses."""
         return self._outcome.passed_over
+
+    @property
+    def marks(self) -> list[Mark]:
+        """Remarks of the recorder found so far (`logs.marks`), at most 10000."""
+        return self._outcome.marks
 
     @property
     def done(self) -> float:

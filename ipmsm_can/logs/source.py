@@ -9,12 +9,13 @@ import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Self, cast
 
 from ipmsm_can.frames import FrameBlock
+from ipmsm_can.logs.marks import Mark
 
 CHUNK_BYTES = 1 << 20
 BROKEN = (EOFError, zlib.error, gzip.BadGzipFile)
@@ -50,12 +51,14 @@ class Outcome:
 
     problem: why it ended before the end of the file, "" where it did not.  bad_lines: lines of a text not
     understood.  passed_over: objects of a BLF file that hold no frame.  done: share of the file read, 0..1.
+    marks: remarks found between the frames, at most `marks.KEPT`.
     """
 
     problem: str = ""
     bad_lines: int = 0
     passed_over: int = 0
     done: float = 0.0
+    marks: list[Mark] = field(default_factory=list)
 
 
 class Source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -79,6 +80,8 @@ class MappedTracking:
     """The estimator over the samples of a map, at a rate that allows it.
 
     summary: as of a native replay.  filled, unusable: how many samples.  sink: called with the next rows.
+    latest: angle [rad electrical], speed [rad/s electrical], 1-sigma [rad electrical], flags of `confidence` and
+    excitation [V^2 s] at the newest sample.
     Times of rows count sample periods from the first sample.
     """
 
@@ -87,6 +90,7 @@ class MappedTracking:
         self.summary = NodeSummary(sample_rate=rate)
         self.filled = self.unusable = self.lost = 0
         self.estimator = Estimator(config.build_motor(), rate, settings_with(config, inverter))
+        self.latest = (math.nan, 0.0, math.pi, 0, 0.0)
         self._max_gap = config.wire.max_gap
         self._sink = sink
         self._rate = rate
@@ -108,6 +112,8 @@ class MappedTracking:
             return
         samples, source, index = np.ascontiguousarray(samples[:, :m]), source[:m], index[:m].copy()
         e = self.estimator.process(samples, left[:m].copy())
+        self.latest = (float(e.angle[speed.THETA_HAT, -1]), float(e.angle[speed.OMEGA, -1]), float(e.sigma[-1]),
+                       int(e.flags[-1]), float(e.excitation[-1]))
         filled = source < 0
         self.filled += int(np.count_nonzero(filled))
         self.lost += int(left[:m][left[:m] < RESTARTED].sum()) + int(np.count_nonzero(filled))

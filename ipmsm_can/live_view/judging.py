@@ -1,0 +1,188 @@
+"""The findings' process: frames in through a pipe, findings out through another.
+
+To judge a drive takes tenths of a second of computing every few seconds, in pieces that hold a Python process up
+for tens of milliseconds: too long beside a thread that has to answer within one.  So it is done by a process of its
+own, at low priority.
+
+`python -m ipmsm_can.live_view.judging` is that process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import IO, TYPE_CHECKING, Any, Protocol
+
+from ipmsm_can.frames import FrameBlock
+from ipmsm_can.live_view.status import SEVERITIES, Told
+
+if TYPE_CHECKING:
+    from ipmsm_can.config import DriveConfig
+
+JUDGE_S = 2.0
+"""Time between two judgements [s]."""
+DRIVE_S = 5.0
+"""The least time between two judgements of a drive, the dearest [s]."""
+_NICE = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is to be judged.  rates: nominal and data bit rate [bit/s].  error_classes: as in `BusHealth`."""
+
+    configs: tuple[DriveConfig, ...]
+    rates: tuple[int, int]
+    error_classes: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """Frames, and what the port knows as of then.
+
+    drops: frames dropped by the kernel, -1 where nobody tells.  outages, outage_time [s].  no_bus: why there is
+    none now, "" where there is one.
+    """
+
+    block: FrameBlock
+    drops: int = -1
+    outages: int = 0
+    outage_time: float = 0.0
+    no_bus: str = ""
+
+
+class Source(Protocol):
+    """Something that makes findings of frames, in memory that does not grow.  Two threads may call it."""
+
+    def feed(self, batch: Batch) -> None:
+        """Take in frames."""
+
+    def findings(self) -> Sequence[Told]:
+        """What is the matter as of now."""
+
+
+class BusSource:
+    """The bus's health."""
+
+    def __init__(self, plan: Plan) -> None:
+        from ipmsm_can.bus.health import BusHealth, warm_up
+        from ipmsm_can.config.build import build_protocol
+
+        protocol = build_protocol(plan.configs)
+        warm_up(protocol)
+        self._health = BusHealth(*plan.rates, protocol=protocol, error_classes=plan.error_classes)
+
+    def feed(self, batch: Batch) -> None:
+        """Take in frames."""
+        self._health.note_port(batch.drops)
+        self._health.note_outages(batch.outages, batch.outage_time, batch.no_bus)
+        self._health.update(batch.block)
+
+    def findings(self) -> list[Told]:
+        """As of now."""
+        return [Told(f.severity, f.sentence, f.advice) for f in self._health.report().findings]
+
+
+class DriveSource:
+    """The diagnosis of a drive.  name: put before each sentence, "" where there is but one drive."""
+
+    def __init__(self, config: DriveConfig, name: str) -> None:
+        from ipmsm_can.diagnosis.live import LiveDiagnosis
+
+        self._diagnosis = LiveDiagnosis(config, every_s=DRIVE_S)
+        self._name = name
+
+    def feed(self, batch: Batch) -> None:
+        """Take in frames."""
+        self._diagnosis.feed(batch.block)
+
+    def findings(self) -> list[Told]:
+        """As of now; the cause of the rest first."""
+        return [Told(f.severity if f.severity in SEVERITIES else "notice", self._name + f.sentence, f.advice)
+                for f in self._diagnosis.findings()]
+
+
+def build_sources(plan: Plan) -> dict[str, Source]:
+    """What is looked at, by its name in words."""
+    sources: dict[str, Source] = {"the bus": BusSource(plan)}
+    for config in plan.configs:
+        number, several = config.wire.node, len(plan.configs) > 1
+        sources[f"drive {number}"] = DriveSource(config, f"drive {number}: " if several else "")
+    return sources
+
+
+class Judge:
+    """Sources together; one that fails ends alone, with a sentence in its place."""
+
+    def __init__(self, sources: Mapping[str, Source]) -> None:
+        self._sources = sources
+        self._broken: dict[str, str] = {}
+
+    def feed(self, batch: Batch) -> None:
+        """Take in frames."""
+        for name, source in self._sources.items():
+            self._guard(name, partial(source.feed, batch))
+
+    def findings(self) -> tuple[Told, ...]:
+        """As of now, gravest first."""
+        found: list[Told] = []
+        for name, source in self._sources.items():
+            found += self._guard(name, source.findings) or ()
+        found += [Told("warning", words) for words in self._broken.values()]
+        return tuple(sorted(found, key=lambda told: SEVERITIES.index(told.severity)))
+
+    def _guard(self, name: str, call: Callable[[], Any]) -> Any:
+        if name in self._broken:
+            return None
+        try:
+            return call()
+        except Exception as error:
+            self._broken[name] = f"The check of {name} failed and was ended: {type(error).__name__}: {error}"
+            return None
+
+
+def serve(source: IO[bytes], out: IO[bytes]) -> None:
+    """Plan and batches come in; the names of what is looked at go out, then findings every JUDGE_S."""
+    sources = build_sources(pickle.load(source))
+    judge = Judge(sources)
+    over = threading.Event()
+
+    def read() -> None:
+        with contextlib.suppress(EOFError, pickle.UnpicklingError, OSError, ValueError):
+            while True:
+                judge.feed(pickle.load(source))
+        over.set()
+
+    _tell(out, tuple(sources))
+    threading.Thread(target=read, name="frames", daemon=True).start()
+    while not over.wait(JUDGE_S):
+        _tell(out, judge.findings())
+
+
+def _tell(out: IO[bytes], what: object) -> None:
+    out.write(pickle.dumps(what))
+    out.flush()
+
+
+def main() -> int:
+    """The findings' process: it ends when the program that feeds it does, not by the user's Ctrl-C."""
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    out = sys.stdout.buffer
+    sys.stdout = sys.stderr  # what a library may print must not get among the findings
+    with contextlib.suppress(OSError, EOFError, pickle.UnpicklingError):
+        serve(sys.stdin.buffer, out)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
