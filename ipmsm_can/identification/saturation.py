@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 MATTERS = 0.02
 """Change of a flux linkage by saturation, as a share of L_q i_q at the log's current, that is told."""
-_SURE = 6.0
+_SURE = 4.0
 """By how many standard errors it must be there."""
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from ipmsm_can.identification.result import MOTOR_PARAMETERS, UNITS, Identification, Parameter
 
 _SHOWN = {"H": ("mH", 1e3), "Wb": ("mWb", 1e3), "rad electrical": ("deg el.", 180.0 / math.pi)}
-_TITLES = {"dead_time_voltage": "dead time, per phase", "dead_time_zone": "dead time fades below",
+_TITLES = {"dead_time_voltage": "dead time", "dead_time_zone": "dead time zone",
            "encoder_zero": "encoder's zero", "voltage_delay": "voltage late by", "v_offset_alpha": "v offset alpha",
            "v_offset_beta": "v offset beta", "i_offset_alpha": "i offset alpha", "i_offset_beta": "i offset beta"}
 _COPPER = 0.00393
