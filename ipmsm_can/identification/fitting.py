@@ -110,6 +110,9 @@ def _with_encoder(pieces: list[Stretch], rate: float, motor: Motor) -> Identific
     return replace(out, notes=(*out.notes, bent)) if bent else out
 
 
+_OWN_SENSORLESS = {free.R: 4e-3, free.PSI_M: 8e-5, free.DEAD_TIME: 8e-3}
+_OWN_OFFSET = 4e-4
+"""The same as _OWN without an encoder; of the offsets of the currents, as a share of rated current."""
 _NEEDS_TURNING = ("psi_m", "encoder_zero", "voltage_delay", "v_offset_alpha", "v_offset_beta")
 _OWN = {fit.R: 3e-4, fit.L_D: 3e-4, fit.L_Q: 1e-4, fit.PSI_M: 2e-5}
 """Error of the fit itself, as a share of the parameter: what the wire's steps and the path of the current between
@@ -172,6 +175,10 @@ def _sensorless(m: Measurement, motor: Motor) -> Identification:
         r, _, _, i = free.rows(chosen, m.sample_rate, p)
         scatter = max(float(r.std()) / p[free.L_D], 1e-6)
     solution = judge(model, p, sigma, time, free.PARAMETERS, free.GIVEN)
+    for k, share in _OWN_SENSORLESS.items():
+        solution.covariance[k, k] += (share * p[k]) ** 2
+    for k in (free.I_ALPHA, free.I_BETA):
+        solution.covariance[k, k] += (_OWN_OFFSET * motor.rated_current) ** 2
     parameters = _parameters(solution, motor, free.NAMES, sigma, low, high, free.GIVEN)
     notes = [_CANNOT[n] for n in ("R", "psi_m") if not parameters[n].told]
     notes.append("L_d and L_q cannot be told without an encoder: a wrong L_q is a wrong angle that nothing "
