@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,6 +25,9 @@ examples:
 exit codes: 0 at least one parameter is told, 1 none is, 2 bad input; a log that is cut off or damaged is bad input,
 too: what was readable of it is used, and one sentence says what was wrong
 """
+
+
+_WIDTH = 79
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -58,9 +62,9 @@ def main(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"log": str(log), "drive": str(drive), **as_dict(found)}, indent=1))
     else:
-        lines = [f"{log}: {basis(found)}", ""]
+        lines = [*_wrapped(f"{log}: {basis(found)}"), ""]
         lines += [*table(found), ""] if found.told else []
-        print("\n".join([*lines, *sentences(found)]).rstrip())
+        print("\n".join([*lines, *(line for s in sentences(found) for line in _wrapped(s))]).rstrip())
     motor_told = found.told & {"R", "L_d", "L_q", "psi_m"}
     if out is not None and motor_told:
         from ipmsm_can.identification.write import write_identified
@@ -73,6 +77,10 @@ def main(args: argparse.Namespace) -> int:
         print(f"ipmsm-can identify: {m.problem}; what was readable is used", file=sys.stderr)
         return 2
     return 0 if motor_told else 1
+
+
+def _wrapped(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
 
 
 def _checked(out: Path, inputs: tuple[Path, ...]) -> Path:

@@ -212,6 +212,14 @@ def rows(stretches: Sequence[Stretch], sample_rate: float, p: Floats) -> tuple[F
             np.concatenate(number).astype(np.float64))
 
 
+def clean_current(s: Stretch, sample_rate: float, p: Floats) -> Complexes:
+    """dq current (N,) [A] that the flux of the voltages explains before each sample is seen: without its noise."""
+    error = np.empty(len(s), np.complex128)
+    evaluate(s.i, s.v, s.theta, 1.0 / sample_rate, CORNER, p, error, np.empty((PARAMETERS, len(s)), np.complex128))
+    dq = (s.i - complex(p[I_ALPHA], p[I_BETA])) * np.exp(-1j * (s.theta - p[ENCODER_ZERO]))
+    return np.asarray(dq - error.real / p[L_D] - 1j * error.imag / p[L_Q], np.complex128)
+
+
 def used(stretch: Stretch) -> NDArray[np.bool_]:
     """Samples whose prediction error counts: not the first one, nor those that a delay would take from outside."""
     use = stretch.rows.copy()

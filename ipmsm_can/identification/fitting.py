@@ -21,7 +21,7 @@ from ipmsm_can.identification import sensorless_fit as free
 from ipmsm_can.identification.result import MOTOR_PARAMETERS, Identification, Parameter
 from ipmsm_can.identification.samples import Stretch, encoder_angle, stretches
 from ipmsm_can.identification.saturation import bend
-from ipmsm_can.identification.solve import Solution, judge, minimise
+from ipmsm_can.identification.solve import Solution, judge, memory, minimise, partial
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -93,9 +93,13 @@ def _with_encoder(pieces: list[Stretch], rate: float, motor: Motor) -> Identific
         e = fit.rows(pieces, rate, p)[0]
         scatter = np.maximum(e.std(axis=1) / p[[fit.L_D, fit.L_Q]], 1e-6)
     solution = judge(model, p, sigma, time, p.size)
+    _doubt(solution, model(p), time)
     i = np.concatenate([s.i * np.exp(-1j * (s.theta - p[fit.ENCODER_ZERO])) for s in pieces])
     speed = np.concatenate([np.gradient(s.theta) for s in pieces]) * rate
     parameters = _parameters(solution, motor, fit.NAMES, sigma, low, high)
+    if max(float(np.ptp(s.theta)) for s in pieces) < 2.0 * math.pi:
+        for name in _NEEDS_TURNING:
+            parameters[name] = _untold(parameters[name], "the rotor does not turn")
     notes = [_CANNOT[n] for n in MOTOR_PARAMETERS if not parameters[n].told]
     out = Identification(parameters, "encoder", tuple(scatter.tolist()), i.size, i.size / rate, _range(i.real),
                          _range(i.imag), _range(speed), tuple(notes), name_plate=motor)
@@ -106,10 +110,41 @@ def _with_encoder(pieces: list[Stretch], rate: float, motor: Motor) -> Identific
     return replace(out, notes=(*out.notes, bent)) if bent else out
 
 
+_OWN_SENSORLESS = {free.R: 4e-3, free.PSI_M: 8e-5, free.DEAD_TIME: 8e-3}
+_OWN_OFFSET = 4e-4
+"""The same as _OWN without an encoder; of the offsets of the currents, as a share of rated current."""
+_NEEDS_TURNING = ("psi_m", "encoder_zero", "voltage_delay", "v_offset_alpha", "v_offset_beta")
+_OWN = {fit.R: 3e-4, fit.L_D: 3e-4, fit.L_Q: 1e-4, fit.PSI_M: 2e-5}
+"""Error of the fit itself, as a share of the parameter: what the wire's steps and the path of the current between
+two samples leave; 1-sigma, from simulated runs (tools.identification)."""
+_OWN_BETWEEN = {fit.R: 5e-3, fit.L_D: 0.03, fit.L_Q: 3e-3, fit.PSI_M: 5e-4}
+"""The same where the voltage steps halfway between two samples."""
+
+
+def _doubt(s: Solution, at: tuple[Floats, Floats], time: Floats) -> None:
+    """Widen a solution's covariance by what the fit cannot know of itself.
+
+    Residuals that remember the ones before come from errors of the flux: lost samples, an encoder's steps,
+    saturation.  They are in the currents that the columns are made of as well, where they pass for current: an
+    inductance along an axis with little current comes out too large by their ratio.
+    """
+    residual, columns = at
+    half = time.size // 2
+    for axis, k in ((slice(0, half), fit.L_D), (slice(half, None), fit.L_Q)):
+        kept = memory(residual[axis]) * s.values[k] ** -2.0
+        error = 2.0 * kept / max(partial(columns[axis], k), 1e-300) * s.values[k]
+        s.covariance[k, k] += error * error
+    between = s.values[fit.DELAY] - math.floor(s.values[fit.DELAY])
+    between = 4.0 * between * (1.0 - between)
+    for k in _OWN:
+        s.covariance[k, k] += (s.values[k] * math.hypot(_OWN[k], _OWN_BETWEEN[k] * between**2)) ** 2
+
+
 _CANNOT = {
     "R": "R cannot be told from this log: it holds too little current, or one current only, where dead time "
          "looks the same",
-    "L_d": "L_d cannot be told from this log: the current along d hardly changes",
+    "L_d": "L_d cannot be told from this log: the current along d changes too little beside what else disturbs the "
+           "samples (noise, losses, steps of the encoder, saturation)",
     "L_q": "L_q cannot be told from this log: it holds no load, or one load only, where the encoder's zero looks "
            "the same",
     "psi_m": "psi_m cannot be told from this log: the rotor hardly turns"}
@@ -140,6 +175,10 @@ def _sensorless(m: Measurement, motor: Motor) -> Identification:
         r, _, _, i = free.rows(chosen, m.sample_rate, p)
         scatter = max(float(r.std()) / p[free.L_D], 1e-6)
     solution = judge(model, p, sigma, time, free.PARAMETERS, free.GIVEN)
+    for k, share in _OWN_SENSORLESS.items():
+        solution.covariance[k, k] += (share * p[k]) ** 2
+    for k in (free.I_ALPHA, free.I_BETA):
+        solution.covariance[k, k] += (_OWN_OFFSET * motor.rated_current) ** 2
     parameters = _parameters(solution, motor, free.NAMES, sigma, low, high, free.GIVEN)
     notes = [_CANNOT[n] for n in ("R", "psi_m") if not parameters[n].told]
     notes.append("L_d and L_q cannot be told without an encoder: a wrong L_q is a wrong angle that nothing "

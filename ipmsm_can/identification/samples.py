@@ -76,6 +76,8 @@ def encoder_angle(m: Measurement) -> Floats:
 
 def stretches(m: Measurement, theta: Floats | None) -> list[Stretch]:
     """The unbroken stretches of a measurement; theta: angle at every sample, where it is needed for all of them."""
+    if not len(m):
+        return []
     i, v = m.i_alpha + 1j * m.i_beta, m.v_alpha + 1j * m.v_beta
     good = np.isfinite(i) & np.isfinite(v) & ~m.clipped & m.running
     if theta is not None:

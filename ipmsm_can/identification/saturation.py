@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 
 MATTERS = 0.02
 """Change of a flux linkage by saturation, as a share of L_q i_q at the log's current, that is told."""
-_SURE = 6.0
+_SURE = 4.0
 """By how many standard errors it must be there."""
 
 
@@ -32,7 +32,7 @@ def bend(pieces: Sequence[Stretch], rate: float, p: Floats, scatter: Floats) -> 
     extra = np.concatenate([_columns(s, rate, p) for s in pieces], axis=2)
     base = (columns * weight).reshape(len(p), -1).T
     left = (residual * weight).ravel()
-    i_q = np.concatenate([_dq(s, p).imag for s in pieces])
+    i_q = np.concatenate([fit.clean_current(s, rate, p).imag for s in pieces])
     most = float(np.percentile(np.abs(i_q), 99.0))
     if most == 0.0:
         return ""
@@ -58,15 +58,11 @@ def bend(pieces: Sequence[Stretch], rate: float, p: Floats, scatter: Floats) -> 
     return ""
 
 
-def _dq(s: Stretch, p: Floats) -> NDArray[np.complex128]:
-    return np.asarray(s.i * np.exp(-1j * (s.theta - p[fit.ENCODER_ZERO])), np.complex128)
-
-
 def _columns(s: Stretch, rate: float, p: Floats) -> Floats:
     """(2, 2, rows): prediction errors that either term with a coefficient of 1 would make, along d and q."""
     keep = math.exp(-fit.CORNER / rate)
     turn = np.exp(1j * (s.theta - p[fit.ENCODER_ZERO]))
-    dq = s.i * turn.conj()
+    dq = fit.clean_current(s, rate, p)
     out = []
     for flux in (dq.imag**2 + 2j * dq.real * dq.imag, 1j * dq.imag**3):
         high = lfilter([1.0, -1.0], [1.0, -keep], turn * flux - (turn * flux)[0]) * turn.conj()

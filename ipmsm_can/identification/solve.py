@@ -64,8 +64,9 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
         trial[at] = np.clip(p[at] + np.clip(step, -sigma[at], sigma[at]), low[at], high[at])
         error = np.sqrt(np.diag(np.linalg.inv(information)))
         moved = float(np.max(np.abs(trial - p)[at] / error))
-        residual_there, columns_there = model(trial)
-        cost_there = cost_of(trial, residual_there)
+        with np.errstate(over="ignore", invalid="ignore"):
+            residual_there, columns_there = model(trial)
+            cost_there = cost_of(trial, residual_there)
         if cost_there <= cost * (1.0 + _NO_WORSE):
             p, residual, columns, cost = trial, residual_there, columns_there, cost_there
             if moved < _SMALL_STEP:
@@ -76,6 +77,26 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
             if damping > 1e6:
                 return p, moved < 1.0
     return p, moved < 1.0
+
+
+def partial(columns: Floats, k: int) -> float:
+    """Mean square of column k after the others have taken over what they can of it."""
+    others = np.delete(np.arange(columns.shape[1]), k)
+    c = columns[:, others]
+    gram = product(c, c)
+    gram += np.diag(1e-12 * np.diag(gram) + 1e-300)
+    x = columns[:, k] - np.einsum("ki,i->k", c, np.linalg.solve(gram, product(c, columns[:, [k]])[:, 0]))
+    return float(np.mean(x * x))
+
+
+def memory(residual: Floats) -> float:
+    """Mean square of what residuals (K,) remember of the one before; 0 where it cannot be told from nothing.
+
+    White noise remembers nothing but for its own chance.
+    """
+    kept = float(np.mean(residual[1:] * residual[:-1]))
+    nothing = 2.0 * float(np.var(residual)) / math.sqrt(residual.size)
+    return max(0.0, kept - nothing)
 
 
 def product(a: Floats, b: Floats) -> Floats:
@@ -104,7 +125,8 @@ def judge(model: Model, values: Floats, sigma: Floats, time: Floats, first: int,
     scores = np.stack([np.bincount(block, weights=residual * x) for x in c.T])
     blocks = scores.shape[1]
     freedom = max(blocks - first, _FEWEST)
-    clustered = bread @ (scores @ scores.T) @ bread * (blocks / freedom)
+    with np.errstate(over="ignore", invalid="ignore"):
+        clustered = bread @ (scores @ scores.T) @ bread * (blocks / freedom)
     scale = np.sqrt(np.maximum(np.diag(clustered) / np.diag(white), 1.0))
     covariance = np.diag(sigma**2.0)
     covariance[np.ix_(fitted, fitted)] = white * np.outer(scale, scale)

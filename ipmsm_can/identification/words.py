@@ -8,7 +8,7 @@ from typing import Any
 from ipmsm_can.identification.result import MOTOR_PARAMETERS, UNITS, Identification, Parameter
 
 _SHOWN = {"H": ("mH", 1e3), "Wb": ("mWb", 1e3), "rad electrical": ("deg el.", 180.0 / math.pi)}
-_TITLES = {"dead_time_voltage": "dead time, per phase", "dead_time_zone": "dead time fades below",
+_TITLES = {"dead_time_voltage": "dead time", "dead_time_zone": "dead time zone",
            "encoder_zero": "encoder's zero", "voltage_delay": "voltage late by", "v_offset_alpha": "v offset alpha",
            "v_offset_beta": "v offset beta", "i_offset_alpha": "i offset alpha", "i_offset_beta": "i offset beta"}
 _COPPER = 0.00393
@@ -18,7 +18,7 @@ _SMALL = 0.01
 
 
 def table(found: Identification) -> list[str]:
-    """Lines of at most 79 characters: parameter, value, interval of 95 %, name plate, difference, word."""
+    """Lines: parameter, value, interval of 95 %, name plate, difference, word."""
     rows = [("parameter", "value", "95 % interval", "", "name plate", "off by")]
     rows += [_row(found.parameters[n]) for n in MOTOR_PARAMETERS if n in found.parameters]
     drive = [p for n, p in found.parameters.items() if n not in MOTOR_PARAMETERS and p.told]
@@ -58,8 +58,8 @@ def sentences(found: Identification) -> list[str]:
         share = 100.0 * abs(psi.difference)
         out.append(f"psi_m is {share:.1f} % {_side(psi)} the name plate"
                    + (", as of hot or demagnetised magnets" if psi.difference < 0.0 else ""))
-    out += [f"{n} is {100.0 * abs(told[n].difference):.1f} % {_side(told[n])} the name plate" for n in ("L_d", "L_q")
-            if n in told and _off(told[n])]
+    out += [f"{n} is {100.0 * abs(told[n].difference):.1f} % {_side(told[n])} the name plate"
+            for n in ("L_d", "L_q") if n in told and _off(told[n])]
     delay = told.get("voltage_delay")
     if delay is not None and delay.told and delay.contradicts and abs(delay.value) > 0.05:
         out.append(f"the voltage is reported {delay.value:.2f} samples late: observer.voltage_delay = "
