@@ -1,7 +1,7 @@
 # Plain entry points; each sets up .venv first (tools/setup), which takes no time when nothing changed.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench lint clean firmware-codec firmware-test
+.PHONY: help demo test bench lint clean firmware-codec firmware-test vcan-test
 PYTHON := .venv/bin/python
 # Of the firmware's receiver; longer where it runs unattended.
 FUZZ_SECONDS ?= $(if $(filter true,$(CI)),60,5)
@@ -11,6 +11,7 @@ help:
 	@echo "make test    set up, then check style and types and run all tests"
 	@echo "make lint    check style and types only"
 	@echo "make bench   measure the hot paths"
+	@echo "make vcan-test     the tests on a real CAN interface alone"
 	@echo "make firmware-codec    write the firmware's C codec anew from dbc/ipmsm_can.dbc"
 	@echo "make firmware-test     test the firmware's C library: sanitizers, mutants, fuzzing, Cortex-M4F"
 	@echo "make clean   remove everything that was generated, .venv included"
@@ -25,8 +26,14 @@ lint:
 	.venv/bin/mypy --strict
 
 test: lint
-	$(PYTHON) -m pytest -m "not vcan" -n 2 --dist loadfile
-	$(MAKE) firmware-test
+	@# The CAN interface inside User-Mode Linux takes one of two cores, everything else the other.
+	@mkdir -p out; $(MAKE) -s vcan-test >out/vcan-test.log 2>&1 & vcan=$$!; \
+	code=0; $(PYTHON) -m pytest -m "not vcan" && $(MAKE) firmware-test || code=1; \
+	echo "make test: waiting for the tests on a real CAN interface (out/vcan-test.log)"; \
+	wait $$vcan || code=1; cat out/vcan-test.log; exit $$code
+
+vcan-test:
+	@tools/setup test
 	@# Exit code 77 of tools/vcan/run: no CAN interface can be had here.
 	@code=0; \
 	tools/vcan/run env IPMSM_CAN_REQUIRE_VCAN=1 $(PYTHON) -m pytest tests/vcan || code=$$?; \
