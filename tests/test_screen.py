@@ -88,6 +88,7 @@ def test_many_drives_get_a_line_each_and_the_bus_stays() -> None:
     ({"valid": False, "polarity_known": False}, "NOT VALID: may be half a turn off"),
     ({"valid": False, "locked": False}, "NOT VALID: not locked"),
     ({"valid": False}, "NOT VALID: too uncertain"),
+    ({"valid": False, "late": True}, "NOT VALID: samples too late"),
 ])
 def test_an_angle_is_never_shown_as_more_than_it_is(change: dict[str, object], trust: str) -> None:
     node = replace(NODE, **change)  # type: ignore[arg-type]

@@ -153,7 +153,7 @@ def _node_status(node: Node, samples_per_s: float, estimates_per_s: float, ever:
         clipped=count("clipped"), distrusting=node.distrusting,
         timing=delay.words if delay is not None and delay.applied else "",
         ever_locked=bool(ever & confidence.LOCKED), ever_valid=bool(ever & confidence.VALID),
-        encoder=encoder_words(node.encoder))
+        encoder=encoder_words(node.encoder), late=bool(node.receiver.sequencer.state["doubt"][0]))
 
 
 def encoder_words(check: EncoderCheck) -> str:

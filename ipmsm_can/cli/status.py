@@ -25,6 +25,7 @@ class NodeStatus:
     timing: how the voltage's timing is set right, "" where it is taken as it comes.
     ever_locked, ever_valid: the angle was, at some time since the beginning.
     encoder: what the drive's encoder says of the estimate, in words; empty where there is none or all is well.
+    late: samples came so late that whole wraps of their counter may be missing.
     sample_rate: as the drive states it [Hz]; samples_per_s, estimates_per_s: counted.
     """
 
@@ -63,6 +64,7 @@ class NodeStatus:
     ever_locked: bool = True
     ever_valid: bool = True
     encoder: str = ""
+    late: bool = False
 
     @property
     def known(self) -> bool:
@@ -82,6 +84,8 @@ class NodeStatus:
             return "NOT VALID: may be half a turn off"
         if self.distrusting:
             return "NOT VALID: samples were cut off"
+        if self.late:
+            return "NOT VALID: samples too late"
         return "NOT VALID: not locked" if not self.locked else "NOT VALID: too uncertain"
 
 
