@@ -13,19 +13,12 @@ import pytest
 from ipmsm_can.cli import plain
 from ipmsm_can.cli.monitor import INJECTION_WORDS, REASON_WORDS, STATE_WORDS, Rates, injection_words
 from ipmsm_can.cli.render import render
-from ipmsm_can.cli.status import BusStatus, DriveNodeStatus, DriveStatus, NodeStatus, RunStatus
+from ipmsm_can.cli.status import DriveNodeStatus, DriveStatus, RunStatus
 from ipmsm_can.wire.protocol import CompanionState, InjectionReason, InjectionState
+from tests import live_view_status
+from tests.live_view_status import BUS
 
-NODE = NodeStatus(
-    node=3, motor="m2", state="locked", live=True, theta=math.radians(-30.0), sigma=math.radians(0.6), omega=314.2,
-    rpm=1000.1, valid=True, locked=True, polarity_known=True, excitation=5.83, injection="on, 6.0 V: low speed",
-    injecting=True, amplitude=6.0, hf_current=0.35, sample_rate=5000.0, samples_per_s=4999.0,
-    estimates_per_s=1000.0, received=123456, lost=7, filled=5, gaps=1, duplicates=2, reordered=3, resyncs=4,
-    restarts=6, bad_frames=8, rejected_commands=0)
-BUS = BusStatus(
-    description="can0 (SocketCAN, kernel time stamps)", load=0.573, frames=1234567, frames_per_s=5560.0, sent=99,
-    unsent=11, late=9, unknown=12, remote=13, wrong_length=14, drops=15, error_frames=2,
-    errors="2 error frames: 2 x bus-off; now bus-off (silent)", turnaround_p50=120e-6, turnaround_p99=240e-6)
+NODE = replace(live_view_status.NODE, sample_rate=5000.0, samples_per_s=4999.0)
 STATUS = RunStatus("ipmsm-can run", 83.0, False, BUS, (NODE,))
 DRIVE = DriveStatus("ipmsm-can drive", 3.0, 16.0, "vcan0", 1000, 5560.0, 2, 1, (
     DriveNodeStatus(0, "m2", "demo", 3.0, 19.9, 20.0, 3.1, 3.0, 1.2, "rotating", 6.0, 4),))
