@@ -34,7 +34,7 @@ vcan-test:
 	@tools/setup test
 	@# Exit code 77 of tools/vcan/run: no CAN interface can be had here.
 	@code=0; \
-	tools/vcan/run env IPMSM_CAN_REQUIRE_VCAN=1 $(PYTHON) -m pytest tests/vcan || code=$$?; \
+	tools/vcan/run --limit 1500 env IPMSM_CAN_REQUIRE_VCAN=1 $(PYTHON) -m pytest tests/vcan || code=$$?; \
 	if [ $$code = 77 ] && [ "$$CI" = true ]; then \
 		echo "make test: FAILED: the tests on a real CAN interface must run where CI=true"; exit 1; \
 	elif [ $$code = 77 ]; then \
