@@ -26,7 +26,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.motor import Motor
@@ -67,6 +66,8 @@ def saturation_parameters(motor: Motor, saturation: float) -> tuple[float, float
     def excess(u: float) -> float:
         bent = _bend(u, knee) - _bend(0.0, knee) - _SLOPE_AT_ZERO * u
         return float(u + relative_gain(u) * bent - rated)
+
+    from scipy.optimize import brentq  # a third of what a command takes to start, and seldom needed
 
     gain = relative_gain(float(brentq(excess, 1e-9 * rated, rated, xtol=1e-15 * rated))) / motor.L_d
     if gain * _SLOPE_AT_ZERO * motor.L_d >= 1.0 or gain * _bend(0.0, knee) * motor.L_q >= rho:
