@@ -89,7 +89,7 @@ def estimate(i: ArrayLike, v: ArrayLike, sample_rate: float, motor: Motor | str,
         "wire": {"sample_rate": float(sample_rate)} if str(observer).startswith("injection_") else {},
     }, source="estimate()")
     samples = np.ascontiguousarray(np.concatenate([current, voltage]))
-    block = Estimator(motor, float(sample_rate), estimator_settings(config)).process(samples)
+    block = Estimator(motor, float(sample_rate), estimator_settings(config, float(sample_rate))).process(samples)
     return _as_estimate(block, np.arange(samples.shape[1]) / sample_rate)
 
 

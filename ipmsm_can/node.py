@@ -118,7 +118,7 @@ class Node:
         self.rejected_commands = 0
         self._protocol = protocol
         self._motor = config.build_motor()
-        self._settings = estimator_settings(config)
+        self._settings = estimator_settings(config, 0.0)
         self._startup_settings = startup_settings(config) if transmit else None
         self.estimator: Estimator | None = None
         self._clipping = clipping.new_state()
@@ -248,10 +248,11 @@ class Node:
     def _estimate(self, run: SampleRun, withheld: NDArray[np.bool_]) -> EstimateBlock:
         estimator = self.estimator
         if estimator is None or estimator.sample_rate != run.sample_rate:
+            self._settings = estimator_settings(self.config, run.sample_rate)
             estimator = self.estimator = Estimator(self._motor, run.sample_rate, self._settings)
             frequency = min(probing_frequency(self.config, run.sample_rate), 0.5 * run.sample_rate)
             self.meter = meter.new_state(frequency, run.sample_rate)
-            self.scheduler.settings = injection_settings(self.config, run.sample_rate)
+            self.scheduler.use(injection_settings(self.config, run.sample_rate))
             if self._startup_settings is not None:
                 self.startup = StartUp(self._motor, estimator, self._startup_settings)
         if self.startup is None:

@@ -62,8 +62,8 @@ def test_defaults() -> None:
         "rate": 1000.0, "flux_rate": 50.0, "status_rate": 10.0, "valid_sigma": 7.5,
     }
     assert config.injection.model_dump() == {
-        "enabled": True, "waveform": "auto", "amplitude": 6.0, "frequency": 400.0, "sigma_target": None,
-        "speed_on": None, "speed_off": None, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": 60.0,
+        "enabled": True, "waveform": "auto", "amplitude": "auto", "frequency": "auto", "sigma_target": None,
+        "speed_on": None, "speed_off": None, "excitation_on": 0.0, "excitation_off": 0.0, "ramp": None,
         "current_limit": None,
         "time_to_live": 0.1, "period": 0.02, "axis": None, "polarity": True,
         "polarity_current": None, "polarity_amplitude": 30.0,
@@ -187,8 +187,10 @@ WRONG = [
      'injection.period is "50 ms"; allowed is a time below half of injection.time_to_live, 0.1 s'),
     (M2_ONLY + "[observer]\nepsilon = 0.59",
      "observer.epsilon is 0.59; allowed is a flux below the motor's psi_m, 0.59 Wb"),
-    (M2_ONLY + "[wire]\nsample_rate = 800",
-     "injection.frequency is 400 by default; allowed is a frequency below half of wire.sample_rate, 800 Hz"),
+    (M2_ONLY + "[wire]\nsample_rate = 800\n[injection]\nfrequency = 400",
+     "injection.frequency is 400; allowed is a frequency below half of wire.sample_rate, 800 Hz"),
+    (M2_ONLY + "[wire]\nsample_rate = 800\n[observer]\nkind = 'injection_demodulation'",
+     'injection.frequency is "auto" by default; allowed is a frequency from 0 Hz to below half of the sample rate'),
     (M2_ONLY + "[wire]\ndata_bitrate = 500000",
      "wire.data_bitrate is 500000; allowed is wire.bitrate (1000000 bit/s) or more"),
     # several at once

@@ -83,7 +83,7 @@ def test_the_drive_file_outranks_the_map(tmp_path: Path) -> None:
     inverter = make_map(tmp_path, DBC, CURRENT + AXES + "delay = 1\n" + ANGLE)
     assert make_plan(inverter).map.voltage is not None
     auto, given = ({"motor": {"preset": "m2"}, "observer": o} for o in ({}, {"voltage_delay": 0.25}))
-    assert settings_with(config_from(auto), inverter).voltage_delay == 1.0
-    assert settings_with(config_from(given), inverter).voltage_delay == 0.25
+    assert settings_with(config_from(auto), inverter, 1000.0).voltage_delay == 1.0
+    assert settings_with(config_from(given), inverter, 1000.0).voltage_delay == 0.25
     plain = make_map(tmp_path, DBC, CURRENT + AXES + ANGLE)
-    assert settings_with(config_from(auto), plain).voltage_delay is None
+    assert settings_with(config_from(auto), plain, 1000.0).voltage_delay is None

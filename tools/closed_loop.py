@@ -98,8 +98,6 @@ class Case:
 FAILS = {"angle_source": "encoder_then_companion", "encoder_fails_at": 1.3}
 START = {"angle_source": "companion", "open_loop_current": M2.rated_current}
 WAITS = {"angle_source": "companion"}
-PROBING = {"m1": 9.0, "m2": 4.2}
-"""Amplitude [V peak] of the probing signal at a start from standstill; see tools.standstill."""
 LIGHT = {"m1": 0.5, "m2": 1.0}
 """Load of the starts from rest, as a share of rated.  At rated torque the incremental L_q of the saturating M1 is a
 third smaller than the companion is told; the angle then swings with the torque, and the speed with the angle."""
@@ -188,8 +186,6 @@ def run(case: Case, source: str) -> Run:
     plant = PRESETS[case.motor]
     motor = {"preset": case.motor, **{name: factor * getattr(plant, name) for name, factor in case.scale.items()}}
     injection: dict[str, Any] = {"enabled": case.injection}
-    if "saturation" in case.rough:
-        injection["amplitude"] = PROBING[case.motor]
     config = config_from({"motor": motor, "observer": SOURCES[source], "injection": injection})
     drive = {} if source == "encoder" else case.drive
     parameters = DriveParameters(sample_rate=RATE, **case.rough, **drive)

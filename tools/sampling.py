@@ -63,7 +63,8 @@ def observe(setup: Setup, watcher: Watcher, delay: float | str) -> Seen:
     config = config.model_copy(update={"observer": config.observer.model_copy(update={"voltage_delay": delay})})
     parts = Companion([config], protocol(), transmit=False).feed(recording.frames)
     values = np.concatenate([p.run.values for p in parts], axis=1)
-    estimator = Estimator(config.build_motor(), setup.drive.sample_rate, estimator_settings(config))
+    rate = setup.drive.sample_rate
+    estimator = Estimator(config.build_motor(), rate, estimator_settings(config, rate))
     angle, flags, taken = [], [], []
     last = estimator.voltage_delay.applied
     for begin in range(0, values.shape[1], LOOK):

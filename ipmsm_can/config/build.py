@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ipmsm_can.config.model import DriveConfig
+from ipmsm_can.config.model import USUAL_FREQUENCY, DriveConfig
 from ipmsm_can.drive.parameters import DriveNodeSettings, DriveParameters
 from ipmsm_can.estimation.estimator import EstimatorSettings
 from ipmsm_can.injection.scheduler import InjectionSettings
@@ -28,8 +28,11 @@ def build_protocol(configs: Sequence[DriveConfig]) -> Protocol:
 
 SAMPLES_PER_PERIOD = 6
 """Of a probing signal with `frequency = "auto"`: an even number, so that dead time is odd in the samples, too."""
-USUAL_FREQUENCY = 400.0
-"""Frequency [Hz] that the polarity pulses start from where that of the probing signal is chosen by itself."""
+_CURRENT_SHARE = 0.65
+"""Share of the limit of the high-frequency current that `amplitude = "auto"` drives through L_d; the rest is for
+iron that saturates, and for noise in the measured current."""
+_RAMP_S = 0.1
+"""Time [s] in which the amplitude rises to its largest where no ramp is given."""
 _HIGHEST = 4000.0
 _EMF_SHARE = 0.19
 """Voltage error, as a share of `voltage_uncertainty`, that turns an angle found by rotation; on M1 and M2."""
@@ -38,19 +41,32 @@ _FLOOR = 4.0
 
 
 def probing_frequency(config: DriveConfig, sample_rate: float) -> float:
-    """Frequency of the probing signal [Hz] at this sample rate [Hz]: the given one, or for auto a sixth of it."""
+    """Frequency of the probing signal [Hz] at this sample rate [Hz], 0 while not known: the given one, or for auto
+    a sixth of it."""
     given = config.injection.frequency
     if isinstance(given, float):
         return given
+    if not sample_rate or config.observer.kind.startswith("injection_"):
+        return USUAL_FREQUENCY
     return min(float(round(sample_rate / SAMPLES_PER_PERIOD)), _HIGHEST)
 
 
-def estimator_settings(config: DriveConfig) -> EstimatorSettings:
-    """Settings of the estimator, derived defaults (gamma, epsilon) worked out."""
-    o, given = config.observer, config.injection.frequency
+def probing_amplitude(config: DriveConfig, sample_rate: float) -> float:
+    """Largest amplitude of the probing signal [V peak]: the given one, or what L_d and the current limit leave."""
+    given = config.injection.amplitude
+    if isinstance(given, float):
+        return given
+    motor = config.build_motor()
+    reactance = 2.0 * math.pi * probing_frequency(config, sample_rate) * min(motor.L_d, motor.L_q)
+    return min(_CURRENT_SHARE * config.current_limit * reactance, config.injection.polarity_amplitude)
+
+
+def estimator_settings(config: DriveConfig, sample_rate: float = 0.0) -> EstimatorSettings:
+    """Settings of the estimator, derived defaults worked out; sample_rate [Hz], 0 while not known."""
+    o = config.observer
     return EstimatorSettings(o.kind, config.alpha, config.gamma, o.initial_flux, config.epsilon,
                              o.excitation_window, o.speed_bandwidth, o.voltage_uncertainty, o.current_noise,
-                             config.estimate.valid_sigma, given if isinstance(given, float) else USUAL_FREQUENCY,
+                             config.estimate.valid_sigma, probing_frequency(config, sample_rate),
                              o.resistance_uncertainty / 100.0, o.inductance_uncertainty / 100.0, o.adapt_voltage,
                              o.adapt_resistance, o.gamma == "scheduled",
                              o.voltage_delay if isinstance(o.voltage_delay, float) else None,
@@ -61,16 +77,18 @@ def injection_settings(config: DriveConfig, sample_rate: float = 0.0) -> Injecti
     """Settings of the injection scheduler, the current limit worked out; sample_rate [Hz], 0 while not known."""
     i, o = config.injection, config.observer
     on, off = i.speeds
+    amplitude = probing_amplitude(config, sample_rate)
     target = math.radians(config.sigma_target)
     waveform = Waveform.ROTATING if i.waveform == "auto" else Waveform[i.waveform.upper()]
     emf_speed = _EMF_SHARE * o.voltage_uncertainty / (config.build_motor().psi_m * target) if target else 0.0
     return InjectionSettings(
-        enabled=i.enabled, waveform=waveform, amplitude=i.amplitude,
+        enabled=i.enabled, waveform=waveform, amplitude=amplitude,
         frequency=probing_frequency(config, sample_rate), speed_on=on, speed_off=off,
-        excitation_on=i.excitation_on, excitation_off=i.excitation_off, ramp=i.ramp,
-        current_limit=config.current_limit, time_to_live=i.time_to_live, period=i.period,
-        axis=None if i.axis is None else math.radians(i.axis), sigma_target=target,
-        emf_speed=0.0 if i.by_speed else emf_speed, floor=min(_FLOOR * o.voltage_uncertainty, i.amplitude),
+        excitation_on=i.excitation_on, excitation_off=i.excitation_off,
+        ramp=amplitude / _RAMP_S if i.ramp is None else i.ramp, current_limit=config.current_limit,
+        time_to_live=i.time_to_live, period=i.period, axis=None if i.axis is None else math.radians(i.axis),
+        sigma_target=target, emf_speed=0.0 if i.by_speed else emf_speed,
+        floor=min(_FLOOR * o.voltage_uncertainty, amplitude),
         along_d=i.waveform == "auto" and o.kind == "riccati" and i.axis is None)
 
 

@@ -30,6 +30,9 @@ Waveform = Literal["auto", "rotating", "pulsating"]
 ROTATING_CONVERGENCE = 70.0
 """Convergence rate gamma |Phi|^2 [1/s] of a fast-turning rotor that the default gamma gives."""
 
+USUAL_FREQUENCY = 400.0
+"""Frequency [Hz] that the polarity pulses start from where that of the probing signal is chosen by itself, and of
+the probing signal itself while the sample rate is not known and for the kinds injection_*."""
 ALPHA, RICCATI_ALPHA = 10.0, 100.0
 """Default bandwidth of the filters [1/s]: the paper's, and for riccati the inverse of a voltage error's correlation
 time, as the filter has a covariance to hold what a narrow one would have to hold."""
@@ -227,13 +230,14 @@ class InjectionConfig(Section):
         doc="rotating in the stationary frame, pulsating along the estimated d-axis, where it makes least torque, "
             "or auto: rotating, and pulsating while the angle of riccati is valid.",
         choices=get_args(Waveform))] = "auto"
-    amplitude: Annotated[float, Quantity(
-        doc="Largest amplitude of the injected voltage; sigma_target may ask for less.",
-        unit=units.VOLT_PEAK, above=0, most=1000)] = 6.0
+    amplitude: Annotated[float | Literal["auto"], QuantityOrWord(
+        doc="Largest amplitude of the injected voltage; sigma_target may ask for less. auto: two thirds of what "
+            "drives current_limit through L_d at that frequency, at most polarity_amplitude.",
+        word="auto", unit=units.VOLT_PEAK, above=0, most=1000)] = "auto"
     frequency: Annotated[float | Literal["auto"], QuantityOrWord(
         doc="Frequency of the injected voltage; less than half of wire.sample_rate. auto: a sixth of the sample "
-            "rate, which needs more voltage for less torque ripple and loss.",
-        word="auto", unit=units.HERTZ, least=1, most=20e3)] = 400.0
+            "rate, at most 4 kHz; 400 Hz for the observers of kind injection_.",
+        word="auto", unit=units.HERTZ, least=1, most=20e3)] = "auto"
     sigma_target: Annotated[float | None, Quantity(
         doc="1-sigma that injection is to keep the angle of riccati below, with the least amplitude (electrical); "
             "0: always the full amplitude. Where it cannot be kept the amplitude is the full one.",
@@ -257,8 +261,9 @@ class InjectionConfig(Section):
     excitation_off: Annotated[float, Quantity(
         doc="Excitation above which the former reason to inject ends; above excitation_on, or both 0.",
         unit=units.EXCITATION, least=0)] = 0.0
-    ramp: Annotated[float, Quantity(
-        doc="Rate at which the amplitude rises and falls.", unit=units.VOLT_PER_SECOND, above=0)] = 60.0
+    ramp: Annotated[float | None, Quantity(
+        doc="Rate at which the amplitude rises and falls.", unit=units.VOLT_PER_SECOND, above=0,
+        default="the largest amplitude in 0.1 s", example="60 V/s")] = None
     current_limit: Annotated[float | None, Quantity(
         doc="Limit of the high-frequency current; the amplitude is reduced to stay below it.",
         unit=units.AMPERE_PEAK, above=0,
@@ -365,9 +370,9 @@ class DriveConfig(BaseModel):
                                                "schedule")
         rate, frequency = self.wire.sample_rate, self.injection.frequency
         if frequency == "auto":
-            if self.observer.kind.startswith("injection_"):
-                raise KeyProblem("injection.frequency", f"a number of Hz for observer.kind {self.observer.kind}")
-            return self._limited()
+            if not self.observer.kind.startswith("injection_"):
+                return self._limited()
+            frequency = USUAL_FREQUENCY
         if rate is not None and self.observer.kind.startswith("injection_"):
             # A window of whole periods, of samples that are faster than two a period.
             low = rate / WINDOW_CAPACITY if self.observer.kind == "injection_extraction" else 0.0

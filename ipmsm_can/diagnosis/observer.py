@@ -64,7 +64,7 @@ def _run(m: Measurement, config: DriveConfig, x: Vectors, wiring: Wiring) -> Obs
     good = np.isfinite(x.i) & np.isfinite(x.v)
     rows = np.flatnonzero(good)
     gap = np.diff(m.sample[rows], prepend=m.sample[rows[0]] - 1) - 1 if rows.size else rows
-    settings = estimator_settings(config)
+    settings = estimator_settings(config, m.sample_rate)
     if m.voltage_delay and settings.voltage_delay is None:
         settings = replace(settings, voltage_delay=m.voltage_delay)
     estimator = Estimator(config.build_motor(), m.sample_rate, settings)

@@ -134,7 +134,8 @@ def cost_per_sample(kind: str, samples: int = 50_000, repeats: int = 5) -> float
     """Seconds a sample of the whole estimator with this observer, in a block: the best of some repeats."""
     scene = SCENES[2]
     config = companion_config(scene.setup, gains_of(scene, kind, False))
-    estimator = Estimator(config.build_motor(), scene.setup.drive.sample_rate, estimator_settings(config))
+    rate = scene.setup.drive.sample_rate
+    estimator = Estimator(config.build_motor(), rate, estimator_settings(config, rate))
     angle = np.arange(samples) * 2.0 * math.pi / 100.0
     block = np.array([np.cos(angle), np.sin(angle), -100.0 * np.sin(angle), 100.0 * np.cos(angle)])
     best = math.inf

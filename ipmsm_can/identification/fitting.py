@@ -200,7 +200,7 @@ def _windows(m: Measurement, motor: Motor) -> tuple[list[free.Window], Floats]:
     speed: list[Floats] = []
     for s in _limited(stretches(m, None), m.sample_rate):
         samples = np.ascontiguousarray([s.i.real, s.i.imag, s.v.real, s.v.imag])
-        e = Estimator(motor, m.sample_rate, estimator_settings(config)).process(samples)
+        e = Estimator(motor, m.sample_rate, estimator_settings(config, m.sample_rate)).process(samples)
         omega = e.angle[OMEGA]
         trusted = (e.flags & confidence.LOCKED != 0) & (np.abs(omega) * motor.psi_m > _CLEAR_EMF)
         trusted &= np.abs(omega) * free.WINDOW_S > 2.0 * math.pi

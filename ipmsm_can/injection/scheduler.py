@@ -76,12 +76,11 @@ class InjectionScheduler:
     """
 
     def __init__(self, settings: InjectionSettings, transmit: bool) -> None:
-        self.settings = settings
+        self.use(settings)
         self.amplitude = 0.0
         self._wanted = False
         self._share = 1.0
         self._along, self._along_below, self._unsure = False, math.pi, 0.0
-        self._rule = SigmaRule(settings.sigma_target, settings.emf_speed, settings.floor / settings.amplitude)
         self._off_left = 0
         self._settling = 0.0
         self._operator: bool | None = None
@@ -91,6 +90,11 @@ class InjectionScheduler:
             self._enter(InjectionState.DISABLED, InjectionReason.DISABLED_BY_CONFIGURATION)
         elif not transmit:
             self._enter(InjectionState.DISABLED, InjectionReason.TRANSMIT_NOT_ENABLED)
+
+    def use(self, settings: InjectionSettings) -> None:
+        """Go on with other settings: the sample rate has become known."""
+        self.settings = settings
+        self._rule = SigmaRule(settings.sigma_target, settings.emf_speed, settings.floor / settings.amplitude)
 
     def _enter(self, state: InjectionState, reason: InjectionReason) -> None:
         self.state = state

@@ -69,9 +69,10 @@ def _fill(values: Floats, gap: Ints, usable: NDArray[np.bool_], max_gap: int, st
     return m
 
 
-def settings_with(config: DriveConfig, inverter: InverterMap) -> EstimatorSettings:
-    """The estimator's settings, with the voltage delay of the map unless the drive.toml gives one."""
-    settings = estimator_settings(config)
+def settings_with(config: DriveConfig, inverter: InverterMap, sample_rate: float) -> EstimatorSettings:
+    """The estimator's settings at this sample rate [Hz], with the voltage delay of the map unless the drive.toml
+    gives one."""
+    settings = estimator_settings(config, sample_rate)
     delay = inverter.voltage.delay if inverter.voltage is not None else 0.0
     return replace(settings, voltage_delay=delay) if settings.voltage_delay is None and delay else settings
 
@@ -89,7 +90,7 @@ class MappedTracking:
                  sink: Callable[[RowBlock], None] | None = None) -> None:
         self.summary = NodeSummary(sample_rate=rate)
         self.filled = self.unusable = self.lost = 0
-        self.estimator = Estimator(config.build_motor(), rate, settings_with(config, inverter))
+        self.estimator = Estimator(config.build_motor(), rate, settings_with(config, inverter, rate))
         self.latest = (math.nan, 0.0, math.pi, 0, 0.0)
         self._max_gap = config.wire.max_gap
         self._sink = sink
