@@ -36,8 +36,8 @@ That is the theory of `ges`; of the other observers it describes
                           fast as the angle does.
                           While the rotor turns, what is wrong with voltage and motor data points everywhere in
                           turn, and 2 sigma are rarely passed; at standstill all of it may stay at its worst and
-                          point the same way, 3 sigma and more.  So an angle has to be surer to become valid there
-                          than to stay so
+                          point the same way, 3 sigma and more.  So an angle has to be surer to be valid there, and
+                          surer still to become so
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
                           is added.  They see an axis, not its north: polarity is not known unless `take_angle`
                           has told them; and none of their angles is valid, for a single window may be far off
@@ -78,10 +78,12 @@ _FORGIVEN = 1.0
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
-_SLOW_SHARE = 0.6
-"""Share of the largest valid 1-sigma at which an angle becomes valid at standstill, and _FAST_EMF: back-EMF over
-the voltage's uncertainty from which on it does at all of it."""
+_SLOW_ENTERS, _SLOW_STAYS = 0.6, 0.75
+"""Share of the largest valid 1-sigma at which an angle becomes valid at standstill, and up to which it stays so."""
 _FAST_EMF = 8.0
+"""Back-EMF over the voltage's uncertainty from which on both are all of it."""
+_CALMING = 0.1
+"""Time constant [s] of the speed that counts for becoming valid: an angle put right looks like a turning rotor."""
 
 LOCKED = 1
 POLARITY_KNOWN = 2
@@ -97,7 +99,7 @@ STATE = np.dtype([
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
     # riccati: losses of lock that are not yet forgotten, for how long [s] nothing is valid, and what was said last.
-    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"),
+    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"), ("calm", "f8"),
 ])
 
 
@@ -227,6 +229,8 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     losses = st.losses
     probation = st.probation
     valid = st.valid
+    calm = st.calm
+    steadying = 1.0 - math.exp(-st.T_s / _CALMING)
     for k in range(flux.shape[1]):
         s = flux[5, k]
         opinion = int(flux[6, k])
@@ -254,9 +258,12 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             locked = 1
         polarity = 1 if opinion & POLARITY else 0
         sigma[k] = s
+        calm += steadying * (omega - calm)
         limit = st.sigma_limit
-        if not valid and st.psi_m * abs(omega) < _FAST_EMF * st.volts:
-            limit *= _SLOW_SHARE + (1.0 - _SLOW_SHARE) * st.psi_m * abs(omega) / (_FAST_EMF * st.volts)
+        share = _SLOW_STAYS if valid else _SLOW_ENTERS
+        turning = abs(omega) if valid else min(abs(omega), abs(calm))
+        if st.psi_m * turning < _FAST_EMF * st.volts:
+            limit *= share + (1.0 - share) * st.psi_m * turning / (_FAST_EMF * st.volts)
         valid = 1 if locked and polarity and s <= limit and probation == 0.0 else 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
     st.test = test
@@ -265,6 +272,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     st.losses = losses
     st.probation = probation
     st.valid = valid
+    st.calm = calm
 
 
 @kernel

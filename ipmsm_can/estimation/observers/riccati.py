@@ -12,9 +12,15 @@ it is, its derivative along x, the Lambda of `chonam`, is added to Phi.
 Noise, in physical units, nothing tuned.
     process        2 v_r^2 CORRELATION_TIME a second in each direction, v_r: what `voltage_errors` leaves
     y, white       2 alpha psi_m L_q s_i: the current noise through x and H
-    shape          of dead time near zero current: how much a phase loses there is anybody's guess, SHAPE of what it
-                   loses elsewhere.  It is a function of the currents, so it keeps its sign as long as these do: it
-                   counts for a sixth of a radian of the rotor, LONGEST where that takes longer
+    shape          of dead time near zero current: how much a phase loses there, but for its corner, is anybody's
+                   guess, SHAPE of what it loses elsewhere.  It is a function of the currents, so it keeps its sign
+                   as long as these do: it counts for a sixth of a radian of the rotor, at most LONGEST
+    square         the regression holds the voltage's errors with their square (`voltage_errors`).  What they are
+                   still wrong by multiplies the error of x_hat, which grew out of them: 2 e~^T x~, and
+                   e~^2/alpha, noise that lasts as long as the shape
+    lost samples   `lost_steps`
+    length         at standstill y says next to nothing of the length of x_hat, and what it says of it under probing
+                   is wrong: |x| = psi_m + L_0 i_d is measured, too, to LENGTH, the less the faster the rotor turns
     y, coloured    2 psi_m v_r, the same voltage error through F.  It keeps its sign for CORRELATION_TIME, so that
                    many samples together say no more than one: its variance counts 2 CORRELATION_TIME/T_s times
     y, transients  2 psi_m dL |H[i]|: a wrong inductance shows while the current changes
@@ -46,20 +52,29 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
-from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, near_zero, predict
+from ipmsm_can.estimation.observers.covariance import across, correct, limit, voltage_variance
+from ipmsm_can.estimation.observers.lost_steps import left_out, straight_on
+from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, near_zero, predict, rounded
 from ipmsm_can.estimation.speed import follow
 
 Floats = NDArray[np.float64]
 
 CORRELATION_TIME = 0.01
 """Time [s] over which a voltage error that is no state is taken as constant."""
-SHAPE = 0.4
+SHAPE = 0.2
 """What a phase near zero current loses, 1-sigma as a share of the dead time's voltage."""
 LONGEST = 0.2
 """Longest time [s] for which the shape of dead time is taken to keep its sign."""
 _SIXTH = 1.0 / 6.0
 INNOVATION_TIME = 0.005
 """Averaging time [s] of the innovation test."""
+CURVED = 8.0
+"""Variance of the product of two errors over that of each: both grow out of the same voltage error, and so go
+together."""
+LENGTH = 0.05
+"""1-sigma of the length of the active flux at standstill, relative to psi_m, for LONGEST."""
+_TURNING = 25.0
+"""Square of the back-EMF over the voltage's uncertainty from which on the length is left to the regression."""
 MODEL_ERROR = 0.1
 """1-sigma of the length of x_hat that wrong parameters explain, relative to psi_m."""
 _LOST_ABOVE = 9.0
@@ -115,7 +130,7 @@ def take_angle(state: NDArray[np.void], psi_m: float, prior: Floats, x_hat: comp
     row, gain = np.zeros(FLUX_STATES), np.zeros(FLUX_STATES)
     row[:2] = -north.imag, north.real
     off = (north * x_hat.conjugate()).imag  # how far x_hat would have to move across the measured direction
-    _correct(P, row, gain, (abs(x_hat) * sigma) ** 2 + 1e-24 * psi_m * psi_m)
+    correct(P, row, gain, (abs(x_hat) * sigma) ** 2 + 1e-24 * psi_m * psi_m)
     st["bias"] += gain[2:] * off
     return complex(gain[0], gain[1]) * off
 
@@ -148,11 +163,19 @@ def doubt(parameters: NDArray[np.void], state: NDArray[np.void]) -> None:
 
 @kernel
 def _filter_units(B: Floats, phi_a: float, phi_b: float, st: Any, p: Any) -> None:
-    """F[B_j] and F[Phi^T F[B_j]] after one interval."""
+    """F[B_j], F[Phi'^T F[B_j]] and F[e^2] after one interval; Phi' = Phi + 2 e, e = sum b_j F[B_j]."""
+    e_a = 0.0
+    e_b = 0.0
     for j in range(BIASES):
         st.unit[j, 0] = p.decay * st.unit[j, 0] + (1.0 - p.decay) * B[j, 0]
         st.unit[j, 1] = p.decay * st.unit[j, 1] + (1.0 - p.decay) * B[j, 1]
-        new = phi_a * st.unit[j, 0] + phi_b * st.unit[j, 1]
+        e_a += st.bias[j] * st.unit[j, 0]
+        e_b += st.bias[j] * st.unit[j, 1]
+    square = e_a * e_a + e_b * e_b
+    st.f_square = p.decay * st.f_square + p.previous * st.square + p.present * square
+    st.square = square
+    for j in range(BIASES):
+        new = (phi_a + 2.0 * e_a) * st.unit[j, 0] + (phi_b + 2.0 * e_b) * st.unit[j, 1]
         st.f_product[j] = p.decay * st.f_product[j] + p.previous * st.product[j] + p.present * new
         st.product[j] = new
 
@@ -165,51 +188,6 @@ def _gradient(i_a: float, i_b: float, x_a: float, x_b: float, epsilon: float) ->
         return 0.0, 0.0
     share = (x_a * i_b - x_b * i_a) / (x2 * math.sqrt(x2))
     return -share * x_b, share * x_a
-
-
-@kernel
-def _across(P: Floats, x_a: float, x_b: float) -> float:
-    """Variance of the flux [Wb^2] across x."""
-    across = x_b * x_b * P[0, 0] - 2.0 * x_a * x_b * P[0, 1] + x_a * x_a * P[1, 1]
-    return float(max(across, 0.0) / (x_a * x_a + x_b * x_b))
-
-
-@kernel
-def _correct(P: Floats, h: Floats, Ph: Floats, noise: float) -> float:
-    """Take a measurement with the row h and the variance `noise` into P; Ph becomes the gain; returns h^T P h.
-
-    P - P h h^T P/(h^T P h + r) is Joseph's form multiplied out for the optimal gain; that h^T P h is not taken
-    below zero keeps P from being corrected by more than there is.
-    """
-    seen = 0.0
-    for a in range(FLUX_STATES):
-        row = 0.0
-        for b in range(FLUX_STATES):
-            row += P[a, b] * h[b]
-        Ph[a] = row
-        seen += row * h[a]
-    seen = max(seen, 0.0)
-    total = seen + noise
-    for a in range(FLUX_STATES):
-        for b in range(a, FLUX_STATES):
-            P[a, b] -= Ph[a] * Ph[b] / total
-            P[b, a] = P[a, b]
-        P[a, a] = max(P[a, a], 0.0)
-    for a in range(FLUX_STATES):
-        Ph[a] /= total
-    return seen
-
-
-@kernel
-def _limit(P: Floats, ceiling: float) -> None:
-    """Nothing is known of a direction whose variance reaches the ceiling; without one P would grow for ever."""
-    largest = max(P[0, 0], P[1, 1])
-    if largest > ceiling:
-        shrink = math.sqrt(ceiling / largest)
-        for a in range(2):
-            for b in range(FLUX_STATES):
-                P[a, b] *= shrink
-                P[b, a] *= shrink
 
 
 @kernel
@@ -281,6 +259,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         shape2 = SHAPE * SHAPE * (bias[2] * bias[2] + P[4, 4]) * near_zero(i_a, i_b, p.zone, p.corner)
         holds = min(max(_SIXTH / max(abs(st.pll_omega), 1e-9), CORRELATION_TIME), LONGEST)
         begins = st.started == 0
+        straight = straight_on(samples, k, st)
         if begins:
             st.started = 1
             if P[0, 0] == 0.0:
@@ -289,13 +268,16 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             # While the voltage is held the back-EMF turns: i'' = L^-1 omega^2 x bends the current away.
             bend = (T_s * st.pll_omega) ** 2 / (12.0 * p.L_d)
             directions(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.zone, B)
+            rounded(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.corner, B)
             l_a += regression[3, k]
             l_b += regression[4, k]
             for j in range(BIASES):
                 l_a += T_s * B[j, 0] * bias[j]
                 l_b += T_s * B[j, 1] * bias[j]
                 bias[j] *= p.keep[j]
-            predict(P, B, T_s, p.keep, p.prior, growth * residual2 + 2.0 * holds * T_s * shape2 + tiny)
+            missed = left_out(i_a - st.i_a, i_b - st.i_b, regression[3, k], regression[4, k], straight, st, p)
+            st.memory += correlated * (2.0 * alpha * psi_m) ** 2 * missed
+            predict(P, B, T_s, p.keep, p.prior, growth * residual2 + 2.0 * holds * T_s * shape2 + missed + tiny)
             _filter_units(B, phi_a, phi_b, st, p)
         st.i_a = i_a
         st.i_b = i_b
@@ -315,6 +297,8 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             st.u_b = 0.0
             st.f_u_a = 0.0
             st.f_u_b = 0.0
+            st.square = 0.0
+            st.f_square = 0.0
             for j in range(BIASES):
                 st.product[j] = 0.0
                 st.f_product[j] = 0.0
@@ -346,7 +330,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             open_ub = decay * st.f_u_b + p.previous * st.u_b
         angle2 = 2.0
         if x2 > epsilon * epsilon:
-            angle2 = min(_across(P, x_a, x_b) / x2, 2.0)
+            angle2 = min(across(P, x_a, x_b) / x2, 2.0)
         known = angle2 < _ANGLE_KNOWN
 
         # The measurement's row, its prediction and its noise.
@@ -354,8 +338,15 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         h[0] = phi_a
         h[1] = phi_b
         volts2 = 0.0
+        e2 = 0.0
         w_a = 2.0 * x_a - (phi_a + L_0 * h_a) / alpha - L_0 * (i_a - h_a / alpha)
         w_b = 2.0 * x_b - (phi_b + L_0 * h_b) / alpha - L_0 * (i_b - h_b / alpha)
+        if known:
+            for j in range(BIASES):
+                w_a -= 2.0 / alpha * bias[j] * unit[j, 0]
+                w_b -= 2.0 / alpha * bias[j] * unit[j, 1]
+            innovation -= (st.square + st.f_square) / alpha
+            e2 = voltage_variance(P, unit)
         for j in range(BIASES):
             e_a = unit[j, 0]
             e_b = unit[j, 1]
@@ -378,15 +369,34 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         tilt = p.tilt * (load_a * load_a + load_b * load_b) / (p.rated * p.rated)
         cross2 = (L_0 * min(tilt, 1.0)) ** 2 * h2
         coloured += 4.0 * psi_m * psi_m * cross2
+        second2 = CURVED * e2 * (max(P[0, 0] + P[1, 1], 0.0) + e2 / (alpha * alpha))
         lasting = 4.0 * psi_m * psi_m * (correlated * residual2 + 2.0 * holds / T_s * (shape2 + cross2))
-        rest = white + d2 + 4.0 * psi_m * psi_m * (volts2 + (p.spread_L * L_q) ** 2 * h2) + st.memory
-        seen = _correct(P, h, gain, rest + lasting)
-        misfit = innovation * innovation / (seen + rest + coloured)
+        lasting += 2.0 * holds / T_s * second2
+        coloured += second2
+        rest = white + d2 + 4.0 * psi_m * psi_m * (volts2 + (p.spread_L * L_q) ** 2 * h2)
+        seen = correct(P, h, gain, rest + lasting + st.memory)
+        misfit = innovation * innovation / (seen + rest + coloured + st.memory / correlated)
         l_a += gain[0] * innovation
         l_b += gain[1] * innovation
         for j in range(BIASES):
             bias[j] += gain[2 + j] * innovation
-        _limit(P, ceiling)
+        # What turns shows its length by itself; at standstill nothing but the magnet tells.
+        fast = (psi_m * st.pll_omega / max(p.volts, 1e-6)) ** 2
+        if known and fast < _TURNING:
+            length = math.sqrt(x2)
+            h[0] = x_a / length
+            h[1] = x_b / length
+            for j in range(BIASES):
+                h[2 + j] = 0.0
+            off = psi_m + L_0 * s - length - (h[0] * gain[0] + h[1] * gain[1]) * innovation
+            noise2 = 2.0 * LONGEST / T_s * psi_m * psi_m * (
+                LENGTH * LENGTH + 0.5 * angle2 * angle2) * (1.0 + fast * fast)
+            correct(P, h, gain, noise2)
+            l_a += gain[0] * off
+            l_b += gain[1] * off
+            for j in range(BIASES):
+                bias[j] += gain[2 + j] * off
+        limit(P, ceiling)
         st.memory *= decay * decay
 
         x_a = l_a - L_q * i_a
@@ -413,7 +423,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         # What to think of it.
         sigma = math.pi
         if x2 > epsilon * epsilon:
-            across2 = _across(P, x_a, x_b)
+            across2 = across(P, x_a, x_b)
             along2 = max(P[0, 0] + P[1, 1] - across2, 0.0)
             i_q2 = max(i2 - s * s, 0.0)
             sigma = math.sqrt((across2 + L_q * L_q * (p.noise * p.noise + p.spread_L * p.spread_L * i_q2)) / x2)

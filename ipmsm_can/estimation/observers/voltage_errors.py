@@ -1,10 +1,13 @@
-"""What may be wrong with the reported voltage, as signals that `riccati` can weigh: four states and their priors.
+"""What may be wrong with the reported voltage, as signals that `riccati` can weigh: five states and their priors.
 
     v_true = v_reported + sum over j of b_j B_j(t)
     B_0, B_1   the alpha and the beta axis: a lasting offset b [V] of the voltage or, through R, of a sensor
     B_2        against the current, phase by phase: dead time, b [V] lost by each phase.  It stands still in the
                rotor's frame for a whole half-period of each phase, so it is no noise: it is one unknown number
     B_3        -i: an error b [ohm] of the resistance
+    B_4        B_2 with its corner at the largest current that it may have, less B_2 with it at the smallest: how
+               much of the dead time begins later.  A wrong corner makes harmonics of the rotor's frequency, which
+               B_2 alone would answer with a wrong dead time
 
 Each b is a Gauss-Markov process: its variance never exceeds its prior, and what nothing tells apart falls back to
 zero with the time constant.  So no rule is needed for what to adapt: the filter moves a state as far as the samples
@@ -12,9 +15,12 @@ carry information against its prior variance, and a state whose prior is zero st
 
 An error of the voltage stands in the regression as well.  With e = F[B_j] and F, H of Lemma 1, F' = 1/(p + alpha),
 
-    y - Phi^T x - d = b n + O(b^2),      n = 2 e^T F[x] - L_0 F[i]^T e - F'[Phi^T e],      F[x] = x - Omega_1/alpha
+    y - Phi^T x - d = b n + b^2 (|e|^2 + F[|e|^2])/alpha,
+    n = 2 e^T (x - (Omega_1 + b e)/alpha) - L_0 F[i]^T e - F'[(Phi + 2 b e)^T e]
 
-which follows from Lemma 1 with Omega_1 + b e and Omega_2 + b e in place of Omega_1 and Omega_2.
+which is Lemma 1 with Omega_1 + b e and Omega_2 + b e in place of Omega_1 and Omega_2, b constant: exact, and n its
+derivative by b.  With several, b e is their sum.  Near standstill the dead time is as large as the back-EMF, and
+the square decides.
 """
 
 from __future__ import annotations
@@ -28,12 +34,12 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.motor import Motor
 
-BIASES = 4
+BIASES = 5
 OFFSET_SHARE = 0.2
 """Lasting offset as a share of `voltage_uncertainty`, which dead time has for itself."""
 RESIDUAL_SHARE = 0.1
-"""What none of the four describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
-_KEEPS = (10.0, 10.0, 10.0, 30.0)
+"""What none of these describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
+_KEEPS = (10.0, 10.0, 10.0, 30.0, 10.0)
 """Time constants [s]: temperature moves all of them."""
 TILT = 3.0
 """That angle [rad electrical] over the share by which L_d falls at rated current, as `drive.magnetics` has it."""
@@ -42,6 +48,10 @@ CORNER_SHARE = 0.2
 capacitances turn the step of the ideal inverter into a ramp, and the current ripple blurs it.  At most CORNER_NOISE
 times the current noise."""
 CORNER_NOISE = 20.0
+CORNER_PRIOR = 0.6
+"""1-sigma of B_4 as a share of the dead time's."""
+OFF = 1.0
+"""What a wrong current makes of a phase at zero current, over what the rest of the shape makes elsewhere."""
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 
 
@@ -66,10 +76,11 @@ class Uncertainty:
         return TILT * self.saturation
 
     def priors(self, motor: Motor) -> tuple[float, ...]:
-        """Prior variances of the four states [V^2, V^2, V^2, ohm^2]."""
+        """Prior variances of the five states [V^2, V^2, V^2, ohm^2, V^2]."""
         offset = (OFFSET_SHARE * self.voltage) ** 2 if self.adapt_voltage else 0.0
         dead_time = self.voltage**2 if self.adapt_voltage else 0.0
-        return offset, offset, dead_time, (self.resistance * motor.R) ** 2 if self.adapt_resistance else 0.0
+        resistance = (self.resistance * motor.R) ** 2 if self.adapt_resistance else 0.0
+        return offset, offset, dead_time, resistance, CORNER_PRIOR**2 * dead_time
 
     @property
     def residual(self) -> float:
@@ -81,8 +92,8 @@ class Uncertainty:
         return 0.0 if self.adapt_resistance else self.resistance * motor.R
 
     def dead_zone(self, motor: Motor) -> float:
-        """Phase current [A] below which the sign of a phase's current is not relied on."""
-        return max(4.0 * self.current, 0.02 * motor.rated_current)
+        """Phase current [A] below which a phase's sign is not relied on: the least corner of dead time."""
+        return 4.0 * self.current
 
     def corner(self, motor: Motor) -> float:
         """Phase current [A] up to which the shape of dead time is uncertain.
@@ -115,24 +126,35 @@ def directions(i_a: float, i_b: float, zone: float, B: NDArray[np.float64]) -> N
 
 
 @kernel
+def rounded(i_a: float, i_b: float, corner: float, B: NDArray[np.float64]) -> None:
+    """Write B_4 once B_2 is there: dead time with its corner at `corner` [A], less B_2."""
+    phase_a = _clipped(i_a / corner)
+    phase_b = _clipped((-0.5 * i_a + _HALF_SQRT3 * i_b) / corner)
+    phase_c = _clipped((-0.5 * i_a - _HALF_SQRT3 * i_b) / corner)
+    B[4, 0] = -(2.0 * phase_a - phase_b - phase_c) / 3.0 - B[2, 0]
+    B[4, 1] = -(phase_b - phase_c) * _HALF_SQRT3 / 1.5 - B[2, 1]
+
+
+@kernel
 def near_zero(i_a: float, i_b: float, zone: float, corner: float) -> float:
     """Square of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
 
     What a phase loses is odd in its current: at zero nobody doubts that it is nothing.  So its share rises up to
-    `zone`, the corner that B_2 assumes, and falls to 0 at the latest possible one, `corner` [A]; the phases' errors
-    are independent.
+    `zone`, the corner that B_2 assumes, and falls to 0 at the latest possible one, `corner` [A].  Within `zone` a
+    wrong current, as an offset of its sensor, makes as much again.  The phases' errors are independent.
     """
     total = 0.0
     for phase in (i_a, -0.5 * i_a + _HALF_SQRT3 * i_b, -0.5 * i_a - _HALF_SQRT3 * i_b):
         share = min(abs(phase) / zone, 1.0) * max(0.0, 1.0 - abs(phase) / corner)
-        total += share * share
+        slope = max(0.0, 1.0 - abs(phase) / zone)
+        total += share * share + OFF * OFF * slope * slope
     return 4.0 / 9.0 * total
 
 
 @kernel
 def predict(P: NDArray[np.float64], B: NDArray[np.float64], T_s: float, keep: NDArray[np.float64],
             prior: NDArray[np.float64], process: float) -> None:
-    """P (6, 6) of (lambda, b) over one interval: lambda += T_s B b, b *= keep; process: growth of lambda [Wb^2].
+    """P (7, 7) of (lambda, b) over one interval: lambda += T_s B b, b *= keep; process: growth of lambda [Wb^2].
 
     P becomes F P F^T + Q, symmetric to the last bit.
     """
