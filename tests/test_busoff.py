@@ -5,13 +5,13 @@ from __future__ import annotations
 
 import errno
 import heapq
+import socket
 from collections.abc import Callable, Sequence
 
 import can
 import numpy as np
 import pytest
 
-from ipmsm_can.bus import busoff
 from ipmsm_can.bus.busoff import PAUSES_NS, WELL_NS, OffWatch, Recovery, restart_controller
 from ipmsm_can.bus.link import Link
 from ipmsm_can.bus.live import LiveRunner
@@ -130,9 +130,9 @@ def test_who_only_listens_says_so() -> None:
 
 def test_the_kernel_is_asked_as_ip_would() -> None:
     """Loopback is no CAN controller: whatever the rights, it is refused, and nothing is changed."""
-    if not hasattr(busoff.socket, "AF_NETLINK"):
+    if not hasattr(socket, "AF_NETLINK"):
         pytest.skip("no netlink here")
-    assert restart_controller(busoff.socket.if_nametoindex("lo")) in (errno.EOPNOTSUPP, errno.EPERM)
+    assert restart_controller(socket.if_nametoindex("lo")) in (errno.EOPNOTSUPP, errno.EPERM)
     assert restart_controller(1 << 30) in (errno.ENODEV, errno.EPERM)
 
 
@@ -410,7 +410,7 @@ class Adapter(can.BusABC):
     def ill(self) -> bool:
         return self.number <= self.well_after
 
-    @property
+    @property  # type: ignore[misc]
     def state(self) -> can.BusState:
         return can.BusState.ERROR if self.ill and self.tells == "state" else can.BusState.ACTIVE
 

@@ -72,7 +72,7 @@ def _about_errors(r: HealthReport) -> Iterator[Finding]:
         yield Finding("error", f"This computer's controller went bus-off {_times(e.bus_offs)}{now}: nothing it "
                                "sends gets through.",
                       "Usually a wrong bit rate, a short circuit or a missing termination. `ip link set can0 type "
-                      "can restart-ms 100` lets it come back by itself.")
+                      "can restart` restarts it; `restart-ms 100`, set while it is down, does so every time.")
     elif e.passive:
         counters = f" (counters tx {e.tx_errors} rx {e.rx_errors})" if e.tx_errors >= 0 else ""
         yield Finding("error", f"This computer's controller was error passive{counters}: it sees many faulty "
