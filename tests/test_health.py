@@ -312,6 +312,7 @@ def test_samples_without_timing_are_told() -> None:
     block = drive_traffic(1.0)
     r = report(block.take(block.can_id != 0x140), 1e6, protocol=PROTOCOL)
     assert "Drive 0 sends samples but no DriveTiming: losses cannot be counted." in sentences(r)
+    assert any("Where other devices send these identifiers: --dbc FILE" in f.advice for f in r.findings)
 
 
 def test_outages_no_bus_and_nothing_at_all() -> None:
