@@ -80,6 +80,9 @@ class SocketCanPort:
         self._libc = ctypes.CDLL(None, use_errno=True)
         self._unsent = 0
         self._timeout_s = math.nan  # what SO_RCVTIMEO is set to
+        self._watch: OffWatch | None = None
+        self._errors = 0  # error frames that were looked at
+        self._off = self._untold = False
         try:
             self._socket = socket.socket(_AF_CAN, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _CAN_RAW)
         except OSError as error:
@@ -96,9 +99,6 @@ class SocketCanPort:
         self._out = MessageTable(max_frames, 0)
         self._in_address = ctypes.c_void_p(self._in.headers.ctypes.data)
         self._state = np.zeros(STATES, np.int64)
-        self._watch: OffWatch | None = None
-        self._errors = 0  # error frames that were looked at
-        self._off = self._untold = False
         # compiled (or loaded from the cache) now and not while the first frames are waiting
         unpack(0, self._in.headers, self._in.control, self._in.frames,
                 np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64), self._state)
