@@ -227,7 +227,7 @@ def test_a_rate_that_wanders() -> None:
 
 def test_payload_lengths_and_names() -> None:
     block = merged(cyclic(0x123, 0.01, 2.0), cyclic(0x124, 0.1, 2.0, length=4), cyclic(0x123, 0.5, 2.0, length=3))
-    r = report(block, name=lambda can_id, extended: "Speed" if can_id == 0x123 else "", database="car.dbc")
+    r = report(block, name=lambda can_id, *_: "Speed" if can_id == 0x123 else "", database="car.dbc")
     told = sentences(r, "notice")
     assert "The length of the payload changes: 0x123 Speed 3 to 8 bytes." in told
     assert "Not in car.dbc: 0x124." in told
@@ -312,6 +312,7 @@ def test_samples_without_timing_are_told() -> None:
     block = drive_traffic(1.0)
     r = report(block.take(block.can_id != 0x140), 1e6, protocol=PROTOCOL)
     assert "Drive 0 sends samples but no DriveTiming: losses cannot be counted." in sentences(r)
+    assert any("Where other devices send these identifiers: --dbc FILE" in f.advice for f in r.findings)
 
 
 def test_outages_no_bus_and_nothing_at_all() -> None:
@@ -461,3 +462,13 @@ def test_the_picture_fits_the_window(recording: Path) -> None:
     assert any("0x100" in one for one in lines)
     assert plain.line(HealthStatus("ipmsm-can bus", 12.0, r)).startswith("0:00:12 SILENT (listening only) load ")
     assert len(table_row(dataclasses.replace(r.ids[0], name="A" * 40, count=10**8))) <= 80
+
+
+def test_a_name_of_ours_needs_a_payload_of_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Another inverter answers on 0x181 with four bytes, and the tabs are as its recorder wrote them."""
+    (tmp_path / "a.log").write_text("(1629633295.166562)\tcan0\t181#8A000004\n"
+                                    "(1629633295.168364)\tcan0\t182#F600000511223344\n")
+    assert main(["bus", str(tmp_path / "a.log"), "-b", "500000"]) == 0
+    shown = capsys.readouterr().out
+    assert "0x182 DriveReference 2" in shown and "0x181 DriveReference" not in shown
+    assert "Not in ipmsm_can.dbc: 0x181." in shown

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ipmsm_can.bus import lane as lanes
 from ipmsm_can.bus.lane import FastLane, Lap
 from ipmsm_can.bus.live import LiveRunner
-from ipmsm_can.bus.socketcan import MessageTable
+from ipmsm_can.bus.message_table import STATES, MessageTable
 from ipmsm_can.bus.warmup import warm_up_companion
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from
@@ -47,7 +47,7 @@ class Port:
         self._theirs.connect(self._ours.getsockname())
         self._ours.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         self.tables = MessageTable(256, 10), MessageTable(256, 0)
-        self.state = np.zeros(4, np.int64)
+        self.state = np.zeros(STATES, np.int64)
 
     def set_timeout(self, timeout_s: float) -> None:
         self._ours.setsockopt(socket.SOL_SOCKET, _SO_RCVTIMEO, struct.pack("@ll", 0, max(1, int(timeout_s * 1e6))))
@@ -57,6 +57,9 @@ class Port:
 
     def check(self) -> None:
         """Nothing to check."""
+
+    def look(self, block: FrameBlock) -> None:
+        """No controller to watch."""
 
     def put(self, raw: NDArray[np.uint8]) -> None:
         for frame in raw:

@@ -82,6 +82,69 @@ def test_lines_by_hand(tmp_path: Path) -> None:
     assert block.t_ns[[0, 8, 9]].tolist() == [1436509052249713000, 1700000000123456789, 1700000000500000000]
 
 
+def test_lines_for_people_are_read_too(tmp_path: Path) -> None:
+    """What `candump -ta` prints, with the variants of -a and of error frames; times that are not absolute are not
+    guessed at."""
+    path = tmp_path / "a.log"
+    path.write_text(
+        " (1700000000.123456)  can0  1DA   [8]  0B 54 00 00 27 10 00 FF\n"
+        " (1700000001.500000)  can1  18FF50E5   [3]  01 02 03\n"
+        " (1700000002.000000)  can0  123   [0] \n"
+        " (1700000003.000000)  can0  123   [4]  remote request\n"
+        " (1700000004.000000)  can0  7FF  [12]  00 01 02 03 04 05 06 07 08 09 0A 0B\n"
+        " (1700000005.000000)  can0  321   [2]  41 42                     'AB'\n"
+        " (1700000006.000000)  can0  20000040   [8]  00 00 00 00 00 00 00 00   ERRORFRAME\n"
+        " (000.000123)  can0  1DA   [2]  0B 54\n"
+        " (1700000007.000000)  can0  1DA   [9]  00 00 00 00 00 00 00 00 00\n"
+        " (1700000007.000000)  can0  1DA   [2]  0B 5\n"
+        " (1700000007.000000)  can0  1DA   [2  0B 55\n"
+        "  can0  1DA   [2]  0B 55\n")
+    reader = read_log(path)
+    block = FrameBlock.concat(reader)
+    assert reader.bad_lines == 5
+    assert [hex(i) for i in block.can_id] == [hex(i) for i in (
+        0x1DA, 0x18FF50E5 | CAN_EFF_FLAG, 0x123, 0x123 | CAN_RTR_FLAG, 0x7FF, 0x321, 0x40 | CAN_ERR_FLAG)]
+    assert block.length.tolist() == [8, 3, 0, 4, 12, 2, 8]
+    assert (block.flags & CANFD_FDF).tolist() == [0, 0, 0, 0, CANFD_FDF, 0, 0]
+    assert block.data[0, :9].tobytes().hex() == "0b5400002710 00ff00".replace(" ", "")
+    assert block.data[4, :13].tobytes().hex() == "000102030405060708090a0b00"
+    assert block.data[5, :3].tobytes() == b"AB\0"
+    assert block.t_ns[:2].tolist() == [1700000000123456000, 1700000001500000000]
+    assert len(read_all(path, channel="can1")) == 1
+
+
+SAVVYCAN = """Time Stamp,ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
+194411100,00000109,false,1,8,00,01,00,FF,FF,FF,0F,0A
+194416200,00000101,false,0,1,84
+194421700,18FF50E5,true,0,7,00,00,00,00,00,00,C8
+"""
+SAVVYCAN_2 = """Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8
+194411100,00000109,false,Rx,1,8,00,01,00,FF,FF,FF,0F,0A,
+194416200,00000101,false,Tx,0,1,84,
+194421700,18FF50E5,true,Rx,0,7,00,00,00,00,00,00,C8,
+"""
+
+
+@pytest.mark.parametrize("text", [SAVVYCAN, SAVVYCAN_2])
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_savvycan_writes_another_csv(tmp_path: Path, text: str, ends: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(text.replace("\n", ends).encode())
+    block = read_all(path)
+    assert block.can_id.tolist() == [0x109, 0x101, 0x18FF50E5 | CAN_EFF_FLAG]
+    assert block.length.tolist() == [8, 1, 7]
+    assert block.data[0, :8].tobytes().hex() == "000100ffffff0f0a" and block.data[2, 6] == 0xC8
+    assert np.abs(block.t_ns - [194411100000, 194416200000, 194421700000]).max() < 100
+    assert read_all(path, channel="1").can_id.tolist() == [0x109]
+    path.write_text(text + text.splitlines()[1].replace(",0A", "") + "\n")
+    reader = read_log(path)
+    assert len(FrameBlock.concat(reader)) == 3
+    assert "a.csv cannot be read as .csv: line 5 is no frame: '194411100,00000109" in reader.problem
+    path.write_text("time;id;data\n1;2;3\n")
+    with pytest.raises(LogError, match="its first line is 'time;id;data'; allowed are the columns of python-can"):
+        list(read_log(path))
+
+
 def test_channel_picks_its_frames(tmp_path: Path) -> None:
     path = tmp_path / "a.log"
     path.write_text(LINES)
@@ -200,7 +263,7 @@ def test_lines_not_understood_are_counted(tmp_path: Path) -> None:
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.lists(st.one_of(st.binary(max_size=40), st.text("(.)#R_ 0123456789ABCDEFx\n", max_size=40)
+@given(st.lists(st.one_of(st.binary(max_size=40), st.text("(.)#R_[r] 0123456789ABCDEFx\n", max_size=40)
                           .map(str.encode)), max_size=20))
 def test_rubbish_never_raises_anything_else(tmp_path: Path, lines: list[bytes]) -> None:
     path = tmp_path / "fuzz.log"
@@ -219,7 +282,7 @@ def test_sentences(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"suffix '.xyz'; allowed are .asc"):
         read_log(tmp_path / "a.xyz")
     (tmp_path / "a.log").write_text("hello\nworld\n")
-    with pytest.raises(LogError, match="none of its 2 lines"):
+    with pytest.raises(LogError, match=r"none of its 2 lines.*`candump -l can0` writes such lines"):
         list(read_log(tmp_path / "a.log"))
     for suffix in (".blf", ".mf4", ".db"):
         path = tmp_path / f"broken{suffix}"

@@ -77,6 +77,15 @@ def test_what_the_log_does_not_hold_is_exit_1(tmp_path: Path, capsys: Capture) -
     assert re.search(r"steady-state checks +no", shown)
 
 
+def test_a_bus_that_has_one_identifier_of_the_map_by_chance(tmp_path: Path, capsys: Capture) -> None:
+    lines = [f"(1629633295.{k:03}000)\tcan0\t0B0#0103640000000000\n" for k in range(99)]
+    (tmp_path / "a.log").write_text("".join(lines))
+    assert main(["map", "--check", str(tmp_path / "a.log"), "cascadia_pm"]) == 1
+    shown = capsys.readouterr().out
+    assert re.search(r"steady-state checks +no +none of the samples have current, voltage", shown)
+    assert "NEVER CAME" in _line(shown, "current.a")
+
+
 def test_too_few_samples_in_a_turn(tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "x.dbc").write_text((map_folder() / "cascadia_pm.dbc").read_text())
     map_text = shipped_maps()["cascadia_pm"].read_text().replace("mean = false", "mean = true")

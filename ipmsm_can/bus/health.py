@@ -59,8 +59,8 @@ class BusHealth:
     """Counts frames and makes a `HealthReport` of them.
 
     bitrate, data_bitrate: of the bus [bit/s], > 0.  assumed_rates: nobody said so, they are a guess.
-    name: the message's name by (identifier, extended), "" for one that is not known; None where there is no
-        database to know any.  database: what that is, in words.
+    name: the message's name by (identifier, extended, least and greatest payload), "" for one that is not known;
+        None where there is no database to know any.  database: what that is, in words.
     protocol: to follow the samples of drives that speak it; None does not look for any.
     error_classes: error frames come from SocketCAN, so that their identifier is Linux' error class; else they are
         only counted.
@@ -70,7 +70,7 @@ class BusHealth:
     """
 
     def __init__(self, bitrate: float, data_bitrate: float, *, assumed_rates: bool = False,
-                 name: Callable[[int, bool], str] | None = None, database: str = "",
+                 name: Callable[[int, bool, tuple[int, int]], str] | None = None, database: str = "",
                  protocol: Protocol | None = None, error_classes: bool = True) -> None:
         self._load = BusLoad(bitrate, data_bitrate)
         self._rates = bitrate, data_bitrate, assumed_rates
@@ -182,7 +182,8 @@ class BusHealth:
             took = float(e["nominal"]) / bitrate + float(e["data"]) / data_bitrate
             whole = int(e["windows"]) > 0
             out.append(IdHealth(
-                can_id=can_id, extended=extended, name=self._name(can_id, extended) if self._name else "",
+                can_id=can_id, extended=extended, name=self._name(
+                    can_id, extended, (int(e["min_length"]), int(e["max_length"]))) if self._name else "",
                 count=int(e["count"]), rate=rate, period=period, jitter=jitter, max_gap=1e-9 * float(e["max_gap"]),
                 max_gap_at=1e-9 * float(e["max_gap_at"] - first_ns) if gaps else math.nan,
                 steady=gaps >= 10 and near >= _STEADY * gaps, least=int(e["least"]) if whole else -1,

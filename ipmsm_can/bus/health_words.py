@@ -22,6 +22,7 @@ DRIFT_PPM, DRIFT_LIMIT_PPM = 150.0, 1000.0
 _SURE = 5.0
 _NAMED = 4
 _ORDER = {"error": 0, "warning": 1, "notice": 2}
+_OR_ANOTHER = "Where other devices send these identifiers: --dbc FILE names them, and nothing is said about drives."
 
 
 def judge(report: HealthReport) -> HealthReport:
@@ -55,7 +56,8 @@ def _about_the_bus(r: HealthReport) -> Iterator[Finding]:
         yield Finding("warning", f"The whole bus was silent for {seconds(r.silence)}, {_at(r.silence_at)}.")
     if r.back:
         yield Finding("warning", f"Time stamps run backwards {_times(r.back)}.",
-                      "The clock was set, or logs were joined; gaps and rates there mean nothing.")
+                      "The clock was set, logs were joined, or one log holds several buses (-c takes one of them); "
+                      "gaps and rates there mean nothing.")
 
 
 def _about_errors(r: HealthReport) -> Iterator[Finding]:
@@ -72,7 +74,7 @@ def _about_errors(r: HealthReport) -> Iterator[Finding]:
         yield Finding("error", f"This computer's controller went bus-off {_times(e.bus_offs)}{now}: nothing it "
                                "sends gets through.",
                       "Usually a wrong bit rate, a short circuit or a missing termination. `ip link set can0 type "
-                      "can restart-ms 100` lets it come back by itself.")
+                      "can restart` restarts it; `restart-ms 100`, set while it is down, does so every time.")
     elif e.passive:
         counters = f" (counters tx {e.tx_errors} rx {e.rx_errors})" if e.tx_errors >= 0 else ""
         yield Finding("error", f"This computer's controller was error passive{counters}: it sees many faulty "
@@ -93,7 +95,8 @@ def _about_losses(r: HealthReport) -> Iterator[Finding]:
                       "The computer answers its interrupts too late.")
     for d in r.drives:
         if not d.sequenced:
-            yield Finding("warning", f"Drive {d.node} sends samples but no DriveTiming: losses cannot be counted.")
+            yield Finding("warning", f"Drive {d.node} sends samples but no DriveTiming: losses cannot be counted.",
+                          _OR_ANOTHER)
         if d.lost:
             share = d.lost / max(1, d.lost + d.received)
             yield Finding("error" if share > 0.01 else "warning",
@@ -104,7 +107,7 @@ def _about_losses(r: HealthReport) -> Iterator[Finding]:
                                      "restarted.")
         if d.bad_frames:
             yield Finding("warning", f"{d.bad_frames} frames of drive {d.node} had a wrong checksum or impossible "
-                                     "content.")
+                                     "content.", "" if d.received else _OR_ANOTHER)
     if r.uncounted:
         yield Finding("notice", f"There are more identifiers than are told apart; {r.uncounted} frames are not in "
                                 "the table.")

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ipmsm_can.bus import lane_kernel as loop
 from ipmsm_can.bus.live import TURNAROUND_EVERY
-from ipmsm_can.bus.socketcan import MessageTable, SocketCanPort
+from ipmsm_can.bus.message_table import STATES, MessageTable
+from ipmsm_can.bus.socketcan import SocketCanPort
 from ipmsm_can.companion import Companion
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.frames import FrameBlock
@@ -81,13 +82,15 @@ class LanePort(Protocol):
 
     def check(self) -> None: ...
 
+    def look(self, block: FrameBlock) -> None: ...
+
 
 class _Nowhere:
     """A port without a socket: every receive fails at once."""
 
     def __init__(self) -> None:
         self.tables = MessageTable(2, 10), MessageTable(2, 0)
-        self.state = np.zeros(4, np.int64)
+        self.state = np.zeros(STATES, np.int64)
 
     def set_timeout(self, timeout_s: float) -> None:
         """Nothing waits here."""
@@ -97,6 +100,9 @@ class _Nowhere:
 
     def check(self) -> None:
         """It is as it should be."""
+
+    def look(self, block: FrameBlock) -> None:
+        """Nothing is ever received."""
 
 
 def warm_up(companion: Companion) -> None:
@@ -230,12 +236,14 @@ class FastLane:
                    MessageKind.DRIVE_REFERENCE: taken - samples - timings - statuses - foreign}
         last_ns = kept.t_ns[taken - 1] if taken else now_ns
         tracked = self._tracked(done) if done else []
+        strange = (FrameBlock(incoming.raw[:left].copy(), incoming.t_ns[:left].copy()) if why == loop.STRANGE
+                   else _NOTHING)
+        if left:
+            port.look(strange)
         if by_kind[MessageKind.DRIVE_REFERENCE]:
             label = MessageKind.DRIVE_REFERENCE * NODES + node.number
             node.hear_encoder(frames, np.flatnonzero(companion.protocol.classify(frames.raw) == label), tracked)
-        return Lap(frames, by_kind, tracked,
-                   FrameBlock(incoming.raw[:left].copy(), incoming.t_ns[:left].copy()) if why == loop.STRANGE
-                   else _NOTHING,
+        return Lap(frames, by_kind, tracked, strange,
                    FrameBlock(kept.sent_words[:sent].copy().view(np.uint8), kept.sent_t_ns[:sent].copy()),
                    FrameBlock(self._outgoing.frames[first:first + unsent].copy(),
                               np.full(unsent, last_ns, np.int64)),

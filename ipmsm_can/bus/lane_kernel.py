@@ -13,7 +13,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.bus.socketcan import unpack
+from ipmsm_can.bus.message_table import unpack
 from ipmsm_can.estimation import regression, speed
 from ipmsm_can.estimation.confidence import VALID
 from ipmsm_can.estimation.estimator import estimate_block

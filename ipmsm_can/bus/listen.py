@@ -51,6 +51,7 @@ class Listener:
     def _wait(self, stop: Callable[[], bool]) -> None:
         while not stop():
             self.link.pause()
+            self._take(self.link.take())
             if self.link.retry():
                 return
 

@@ -108,7 +108,8 @@ class LiveRunner:
         """Take in what had arrived; then try again and again, while the companion sees silence go by."""
         self._deaf_round(link.lose(error), _STALE_S, observer)  # what it claimed is over at once
         while not stop():
-            self._deaf_round(_NOTHING, link.pause(), observer)
+            passed = link.pause()
+            self._deaf_round(link.take(), passed, observer)
             if link.retry():
                 self.port = link.port
                 self._lane = self._find_lane()

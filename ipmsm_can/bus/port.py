@@ -19,6 +19,18 @@ class BusError(OSError):
         return self.strerror or super().__str__()  # the sentence alone, without "[Errno 19]"
 
 
+class BusOffError(BusError):
+    """The controller has switched itself off the bus after too many faulty frames.
+
+    interface: of SocketCAN, whose controller the kernel can restart; "" for any other adapter.
+    Raised only by ports that were told to `watch_bus_off`, once for each time, and by every `send` meanwhile.
+    """
+
+    def __init__(self, sentence: str, interface: str = "") -> None:
+        super().__init__(sentence)
+        self.interface = interface
+
+
 class Port(Protocol):
     """A CAN bus as blocks of frames.
 

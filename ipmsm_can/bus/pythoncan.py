@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import time
 from collections.abc import Iterable, Mapping
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from ipmsm_can.bus.port import BusError
+from ipmsm_can.bus.port import BusError, BusOffError
 from ipmsm_can.frames import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 _HEADER = struct.Struct("<IBB")
 _SEND_PATIENCE_S = 0.02
+_BUS_OFF = re.compile("bus[ _-]?off", re.IGNORECASE)
 
 
 def block_from_messages(messages: Iterable[can.Message]) -> FrameBlock:
@@ -106,6 +108,7 @@ class PythonCanPort:
         self._max_frames = max_frames
         self._unsent = 0
         self._closed = False
+        self._watching = False
 
     @classmethod
     def open(cls, config: Mapping[str, Any]) -> PythonCanPort:
@@ -165,7 +168,9 @@ class PythonCanPort:
                 message = self._bus.recv(timeout_s if expect > 1 else 0)
         except (can.CanError, OSError) as error:
             if not messages:  # else hand over what we have; the error comes back with the next call
-                raise BusError(f"receiving from {self._name} failed: {error}") from error
+                raise self._failed("receiving from", error) from error
+        if not messages and self._is_off():
+            raise self._bus_off()
         return block_from_messages(messages)
 
     def send(self, block: FrameBlock) -> int:
@@ -179,13 +184,39 @@ class PythonCanPort:
         for sent, message in enumerate(messages_from_block(block)):
             try:
                 self._bus.send(message, timeout=max(0.001, deadline - time.monotonic()))
-            except can.CanOperationError:
+            except can.CanOperationError as error:
                 self._unsent += len(block) - sent
+                if self._watching and (_BUS_OFF.search(str(error)) or self._is_off()):
+                    raise self._bus_off() from error
                 return sent
             except (can.CanError, OSError) as error:
                 self._unsent += len(block) - sent
-                raise BusError(f"sending on {self._name} failed: {error}") from error
+                raise self._failed("sending on", error) from error
         return len(block)
+
+    def watch_bus_off(self) -> None:
+        """From now on bus-off counts as a bus that went away: `receive` and `send` raise BusOffError where the
+        adapter's state or its error says so; asked only when nothing comes, or nothing can be sent."""
+        self._watching = True
+
+    def _is_off(self) -> bool:
+        import can
+
+        if not self._watching:
+            return False
+        try:
+            return self._bus.state is can.BusState.ERROR
+        except Exception:  # not every driver can say, and a vendor's library may raise anything
+            return False
+
+    def _bus_off(self) -> BusOffError:
+        return BusOffError(f"the controller of {self._name} is bus-off after too many faulty frames (bit rate, "
+                           "wiring, termination?)")
+
+    def _failed(self, doing: str, error: Exception) -> BusError:
+        if self._watching and _BUS_OFF.search(str(error)):
+            return self._bus_off()
+        return BusError(f"{doing} {self._name} failed: {error}")
 
     def close(self) -> None:
         if not self._closed:

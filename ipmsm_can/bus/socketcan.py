@@ -1,9 +1,8 @@
 """SocketCAN in blocks: one recvmmsg writes many frames straight into an array, one sendmmsg sends many.
 
 The number of system calls decides what a receiver costs; here it is one per block when frames are
-waiting, and one per wake-up when they are not.  The kernel's tables (struct mmsghdr, iovec, cmsghdr,
-see socket(7), recvmmsg(2)) are NumPy arrays in their 64-bit little-endian layout, so that a compiled
-kernel can read what came back.  CAN specifics: Linux Documentation/networking/can.rst.
+waiting, and one per wake-up when they are not.  The tables are those of `message_table`.
+CAN specifics: Linux Documentation/networking/can.rst.
 """
 
 from __future__ import annotations
@@ -22,104 +21,35 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ipmsm_can._jit import kernel
-from ipmsm_can.bus.port import BusError
+from ipmsm_can.bus.busoff import OffWatch, restart_controller
+from ipmsm_can.bus.message_table import (
+    CONTROL_WORDS,
+    DROPS,
+    ERRORS,
+    NO_STAMP,
+    SO_RXQ_OVFL,
+    SO_TIMESTAMPNS,
+    SOL_SOCKET,
+    STATES,
+    MessageTable,
+    unpack,
+)
+from ipmsm_can.bus.port import BusError, BusOffError
 from ipmsm_can.frames import CAN_EFF_FLAG, CANFD_FDF, FRAME_BYTES, FrameBlock
 
 # <sys/socket.h>, <asm-generic/socket.h>, <linux/can/raw.h>, <linux/sockios.h>, <linux/if_arp.h>; Python
 # leaves some of them out, depending on the headers it was built with.
 _AF_CAN, _CAN_RAW, _SOL_CAN_RAW, _ARPHRD_CAN = 29, 1, 101, 280
 _RAW_FILTER, _RAW_ERR_FILTER, _RAW_LOOPBACK, _RAW_RECV_OWN, _RAW_FD_FRAMES = 1, 2, 3, 4, 5
-_SOL_SOCKET = 1
 _SO_RCVBUF, _SO_RCVBUFFORCE, _SO_RCVTIMEO, _SO_SNDTIMEO = 8, 33, 20, 21
-_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 _MSG_DONTWAIT, _MSG_WAITFORONE = 0x40, 0x10000
 _SIOCGIFFLAGS, _SIOCGIFMTU, _SIOCGIFHWADDR, _IFF_UP = 0x8913, 0x8921, 0x8927, 1
 _ALL_ERRORS = 0x1FFFFFFF
 
 CAN_MTU, CANFD_MTU = 16, 72
 
-# columns of struct mmsghdr as 64-bit words
-_IOV, _IOVLEN, _CONTROL, _CONTROLLEN, _FLAGS, _MSG_LEN = 2, 3, 4, 5, 6, 7
-_CONTROL_WORDS = 10  # time stamp 4 words, drop counter 3 words, and room to spare
-
-# state of the receiving kernel
-_S_COUNTER, _S_DROPS, _S_NO_STAMP, _S_ODD = 0, 1, 2, 3
-
 _SEND_PATIENCE_S = 0.02
 _SEND_NAP_S = 0.0002
-
-
-@kernel
-def unpack(n: int, headers: NDArray[np.int64], control: NDArray[np.int64], frames: NDArray[np.uint8],
-            raw: NDArray[np.uint8], t_ns: NDArray[np.int64], state: NDArray[np.int64]) -> int:
-    """Copy n received frames out as clean rows, with their time stamps; rearm their headers.
-
-    Returns the number of rows written; time -1 where the kernel gave none.  state: last drop counter
-    (32 bit), drops in all, frames without a time stamp, messages of an unknown size.
-    """
-    out = 0
-    for j in range(n):
-        size = headers[j, _MSG_LEN] & 0xFFFFFFFF
-        words = min(headers[j, _CONTROLLEN] // 8, control.shape[1])
-        headers[j, _CONTROLLEN] = 8 * control.shape[1]
-        headers[j, _FLAGS] = 0
-        stamp = -1
-        at = 0
-        while at + 2 < words:
-            length = control[j, at]
-            if length < 16:
-                break
-            level = control[j, at + 1] & 0xFFFFFFFF
-            kind = control[j, at + 1] >> 32
-            if level == _SOL_SOCKET and kind == _SO_TIMESTAMPNS and at + 3 < words:
-                stamp = control[j, at + 2] * 1_000_000_000 + control[j, at + 3]
-            elif level == _SOL_SOCKET and kind == _SO_RXQ_OVFL:
-                counter = control[j, at + 2] & 0xFFFFFFFF
-                state[_S_DROPS] += (counter - state[_S_COUNTER]) & 0xFFFFFFFF
-                state[_S_COUNTER] = counter
-            at += (length + 7) // 8
-        if size != 16 and size != 72:
-            state[_S_ODD] += 1
-            continue
-        if stamp < 0:
-            state[_S_NO_STAMP] += 1
-        t_ns[out] = stamp
-        room = 8 if size == 16 else 64
-        used = min(0 + frames[j, 4], room)
-        for k in range(4):
-            raw[out, k] = frames[j, k]
-        raw[out, 4] = used
-        # byte 5 of a classical frame is padding; bytes 6, 7 are reserved or the raw DLC
-        raw[out, 5] = 0 if size == 16 else frames[j, 5] | 0x04
-        raw[out, 6] = 0
-        raw[out, 7] = 0
-        if frames[j, 3] & 0x40:  # a remote frame carries a length but no data
-            used = 0
-        for k in range(8, 8 + used):
-            raw[out, k] = frames[j, k]
-        for k in range(8 + used, 72):
-            raw[out, k] = 0
-        out += 1
-    return out
-
-
-class MessageTable:
-    """M struct mmsghdr, each pointing to one row of `frames` and, for receiving, of `control`."""
-
-    def __init__(self, rows: int, control_words: int) -> None:
-        self.frames = np.zeros((rows, FRAME_BYTES), np.uint8)
-        self.control = np.zeros((rows, max(control_words, 1)), np.int64)
-        self.iov = np.zeros((rows, 2), np.int64)
-        self.iov[:, 0] = self.frames.ctypes.data + FRAME_BYTES * np.arange(rows)
-        self.iov[:, 1] = FRAME_BYTES
-        self.headers = np.zeros((rows, 8), np.int64)
-        self.headers[:, _IOV] = self.iov.ctypes.data + 16 * np.arange(rows)
-        self.headers[:, _IOVLEN] = 1
-        if control_words:
-            width = 8 * control_words
-            self.headers[:, _CONTROL] = self.control.ctypes.data + width * np.arange(rows)
-            self.headers[:, _CONTROLLEN] = width
 
 
 class SocketCanPort:
@@ -150,6 +80,9 @@ class SocketCanPort:
         self._libc = ctypes.CDLL(None, use_errno=True)
         self._unsent = 0
         self._timeout_s = math.nan  # what SO_RCVTIMEO is set to
+        self._watch: OffWatch | None = None
+        self._errors = 0  # error frames that were looked at
+        self._off = self._untold = False
         try:
             self._socket = socket.socket(_AF_CAN, socket.SOCK_RAW | socket.SOCK_CLOEXEC, _CAN_RAW)
         except OSError as error:
@@ -162,10 +95,10 @@ class SocketCanPort:
             raise
         self._handle = self._socket.fileno()
         self._rows = max_frames
-        self._in = MessageTable(max_frames, _CONTROL_WORDS)
+        self._in = MessageTable(max_frames, CONTROL_WORDS)
         self._out = MessageTable(max_frames, 0)
         self._in_address = ctypes.c_void_p(self._in.headers.ctypes.data)
-        self._state = np.zeros(4, np.int64)
+        self._state = np.zeros(STATES, np.int64)
         # compiled (or loaded from the cache) now and not while the first frames are waiting
         unpack(0, self._in.headers, self._in.control, self._in.frames,
                 np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64), self._state)
@@ -186,12 +119,12 @@ class SocketCanPort:
         if filters is not None:
             option(_SOL_CAN_RAW, _RAW_FILTER, _pack_filters(filters))
         try:
-            option(_SOL_SOCKET, _SO_RCVBUFFORCE, receive_buffer)
+            option(SOL_SOCKET, _SO_RCVBUFFORCE, receive_buffer)
         except OSError:
-            option(_SOL_SOCKET, _SO_RCVBUF, receive_buffer)
-        option(_SOL_SOCKET, _SO_RXQ_OVFL, 1)
-        option(_SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-        option(_SOL_SOCKET, _SO_SNDTIMEO, struct.pack("@ll", 0, int(_SEND_PATIENCE_S * 1e6)))
+            option(SOL_SOCKET, _SO_RCVBUF, receive_buffer)
+        option(SOL_SOCKET, SO_RXQ_OVFL, 1)
+        option(SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        option(SOL_SOCKET, _SO_SNDTIMEO, struct.pack("@ll", 0, int(_SEND_PATIENCE_S * 1e6)))
         self._socket.bind((self._channel,))
         self._index = socket.if_nametoindex(self._channel)
         return use_fd
@@ -218,16 +151,19 @@ class SocketCanPort:
         if kind != _ARPHRD_CAN:
             raise BusError(errno.ENODEV, f"{self._channel} is a network interface, but not a CAN one")
         if not flags & _IFF_UP:
-            raise BusError(errno.ENETDOWN, self._down_sentence())
+            raise self._down(errno.ENETDOWN)
         return int(mtu)
 
-    def _down_sentence(self) -> str:
-        return (f"{self._channel} is down; bring it up with `ip link set {self._channel} up type can bitrate "
-                "1000000` (a vcan without `type can ...`)")
+    def _down(self, code: int) -> BusError:
+        self._off = self._untold = False  # a controller that is started anew is on the bus
+        if self._watch is not None:
+            self._watch.off = False
+        return BusError(code, f"{self._channel} is down; bring it up with `ip link set {self._channel} up type can "
+                              "bitrate 1000000` (a vcan without `type can ...`)")
 
     @property
     def description(self) -> str:
-        stamps = "kernel time stamps" if not self._state[_S_NO_STAMP] else "time stamps at reading"
+        stamps = "kernel time stamps" if not self._state[NO_STAMP] else "time stamps at reading"
         return f"{self._channel} (SocketCAN, {stamps})"
 
     @property
@@ -236,7 +172,7 @@ class SocketCanPort:
 
     @property
     def drops(self) -> int:
-        return int(self._state[_S_DROPS])
+        return int(self._state[DROPS])
 
     @property
     def unsent(self) -> int:
@@ -245,7 +181,7 @@ class SocketCanPort:
     @property
     def buffer_bytes(self) -> int:
         """Bytes of receive buffer the kernel granted (it doubles what was asked, for its own overhead)."""
-        return self._socket.getsockopt(_SOL_SOCKET, _SO_RCVBUF)
+        return self._socket.getsockopt(SOL_SOCKET, _SO_RCVBUF)
 
     @property
     def tables(self) -> tuple[MessageTable, MessageTable]:
@@ -262,8 +198,35 @@ class SocketCanPort:
         if timeout_s != self._timeout_s:
             self._set_timeout(timeout_s)
 
+    def watch_bus_off(self) -> None:
+        """From now on bus-off counts as a bus that went away: `receive`, `send` and `check` raise BusOffError."""
+        self._watch = self._watch or OffWatch()
+
+    def look(self, block: FrameBlock) -> None:
+        """Note what received frames say of the controller; for a loop that reads the tables itself."""
+        errors = int(self._state[ERRORS])
+        if self._watch is None or not (self._off or errors != self._errors):
+            return
+        self._errors = errors
+        self._watch.update(block)
+        if self._watch.off != self._off:
+            self._off = self._untold = self._watch.off
+
+    def restart(self) -> int:
+        """Ask the kernel to restart the controller, see `restart_controller`; returns 0 or the errno."""
+        code = restart_controller(self._index)
+        if code == errno.EBUSY and self._watch is not None:
+            self._off = self._untold = self._watch.off = False
+        return code
+
+    def _bus_off(self) -> BusOffError:
+        self._untold = False
+        return BusOffError(f"the controller of {self._channel} is bus-off after too many faulty frames (bit rate, "
+                           "wiring, termination?)", self._channel)
+
     def check(self) -> None:
-        """Raise BusError when the interface is down or gone, or was made anew: this socket is bound to the old."""
+        """Raise BusError when the interface is down or gone, or was made anew: this socket is bound to the old; and
+        while its controller is bus-off, where that is watched."""
         self._check_interface()
         try:
             index = socket.if_nametoindex(self._channel)
@@ -271,6 +234,8 @@ class SocketCanPort:
             index = 0
         if index != self._index:
             raise BusError(errno.ENODEV, f"{self._channel} was taken away and another put in its place")
+        if self._off:
+            raise self._bus_off()
 
     def fileno(self) -> int:
         """The socket's handle, for select and event loops."""
@@ -282,6 +247,8 @@ class SocketCanPort:
 
         Raises ValueError for a negative or not finite timeout_s.
         """
+        if self._untold:
+            raise self._bus_off()
         if timeout_s > 0.0:
             self.set_timeout(timeout_s)
             flags = _MSG_WAITFORONE if expect <= 1 else 0
@@ -295,25 +262,28 @@ class SocketCanPort:
             self._check_receive(ctypes.get_errno() if n < 0 else 0)
             return FrameBlock(np.empty((0, FRAME_BYTES), np.uint8), np.empty(0, np.int64))
         raw, t_ns = np.empty((n, FRAME_BYTES), np.uint8), np.empty(n, np.int64)
-        unstamped = self._state[_S_NO_STAMP]
+        unstamped = self._state[NO_STAMP]
         rows = unpack(n, self._in.headers, self._in.control, self._in.frames, raw, t_ns, self._state)
-        if self._state[_S_NO_STAMP] != unstamped:
+        if self._state[NO_STAMP] != unstamped:
             t_ns[t_ns < 0] = time.time_ns()
-        return FrameBlock(raw[:rows], t_ns[:rows])
+        block = FrameBlock(raw[:rows], t_ns[:rows])
+        if self._off or self._state[ERRORS] != self._errors:
+            self.look(block)
+        return block
 
     def _set_timeout(self, timeout_s: float) -> None:
         if not math.isfinite(timeout_s):
             raise ValueError(f"timeout_s is {timeout_s!r}; allowed is 0 or more seconds")
         # 0 would mean "for ever" to the kernel
         whole, micro = divmod(max(1, math.ceil(min(timeout_s, 1e6) * 1e6)), 1_000_000)
-        self._socket.setsockopt(_SOL_SOCKET, _SO_RCVTIMEO, struct.pack("@ll", whole, micro))
+        self._socket.setsockopt(SOL_SOCKET, _SO_RCVTIMEO, struct.pack("@ll", whole, micro))
         self._timeout_s = timeout_s
 
     def _check_receive(self, code: int) -> None:
         if code in (0, errno.EAGAIN, errno.EINTR):
             return
         if code == errno.ENETDOWN:
-            raise BusError(code, self._down_sentence())
+            raise self._down(code)
         if code in (errno.ENODEV, errno.EBADF):
             raise BusError(code, f"{self._channel} is gone: {os.strerror(code)}")
         raise BusError(code, f"receiving from {self._channel} failed: {os.strerror(code)}")
@@ -321,6 +291,9 @@ class SocketCanPort:
     def send(self, block: FrameBlock) -> int:
         """See `Port.send`.  A full transmit queue is waited for 20 ms, then the rest is unsent."""
         sent, n = 0, len(block)
+        if self._off:  # the kernel would take them, and some might go out much too late
+            self._unsent += n
+            raise self._bus_off()
         deadline = 0.0
         while sent < n:
             count = min(n - sent, self._rows)
@@ -353,7 +326,7 @@ class SocketCanPort:
 
     def _refuse_send(self, code: int, block: FrameBlock, row: int) -> None:
         if code in (errno.ENETDOWN, errno.ENXIO):
-            raise BusError(code, self._down_sentence())
+            raise self._down(code)
         if code in (errno.EINVAL, errno.EMSGSIZE):
             is_fd = bool(block.flags[row] & CANFD_FDF)
             why = ("the interface takes no CAN FD frames" if is_fd and not self._fd else

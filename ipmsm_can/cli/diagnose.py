@@ -169,6 +169,7 @@ def _listen(link: Link, live: LiveDiagnosis, stop: Callable[[], bool], reconnect
                 raise
             while not stop():
                 link.pause()
+                live.feed(link.take())
                 if link.retry():
                     break
             continue

@@ -151,7 +151,7 @@ def build_health(args: argparse.Namespace, error_classes: bool) -> BusHealth:
                      database=database, protocol=protocol, error_classes=error_classes)
 
 
-def _names(paths: list[str]) -> tuple[Callable[[int, bool], str], str, Protocol | None]:
+def _names(paths: list[str]) -> tuple[Callable[[int, bool, tuple[int, int]], str], str, Protocol | None]:
     """How identifiers are named, from what, and the protocol of the drives if that database has it."""
     from ipmsm_can.wire.dbc import Database, DbcError
     from ipmsm_can.wire.protocol import NODES, UNKNOWN, MessageKind, Protocol
@@ -164,14 +164,16 @@ def _names(paths: list[str]) -> tuple[Callable[[int, bool], str], str, Protocol 
         with suppress(DbcError):  # the database of another kind of bus
             protocol = Protocol(database)
 
-    def name(can_id: int, extended: bool) -> str:
+    def name(can_id: int, extended: bool, lengths: tuple[int, int]) -> str:
         for one in databases:
             codec = one.by_id(can_id, extended)
             if codec is not None:
                 return codec.name
         if protocol is not None and not extended and protocol.id_lut[can_id] != UNKNOWN:
             kind, node = divmod(int(protocol.id_lut[can_id]), NODES)
-            return f"{MessageKind(kind).message} {node}"
+            # of another length it is another device's, which has the identifier by chance
+            if protocol.codecs[MessageKind(kind)].length in lengths:
+                return f"{MessageKind(kind).message} {node}"
         return ""
 
     return name, " and ".join(Path(p).name for p in paths) or "ipmsm_can.dbc", protocol

@@ -114,7 +114,8 @@ def main(args: argparse.Namespace) -> int:
         warm_up_companion(configs, protocol)
         warm_up()
     configs, open_port, source = _opener(args, configs, protocol)
-    with (_stop(args.duration) as stop, _short_turns(), open_port() as port, Link(port, open_port) as link,
+    with (_stop(args.duration) as stop, _short_turns(), open_port() as port,
+          Link(port, open_port, transmits=args.transmit) as link,
           _recording(args, link, configs, protocol) as (record, tap)):
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
                             None if args.no_reconnect else link)

@@ -124,11 +124,10 @@ class RunMonitor:
     def _no_bus(self) -> str:
         """Why there is no bus now: the interface is gone, or its controller has switched itself off."""
         link = self.runner.link
-        if link is not None and link.down:
+        if link is not None:
             return link.words
         if self.errors.state is BusState.BUS_OFF:
-            return ("no bus: the controller is bus-off (`ip link set can0 type can restart-ms 100` lets it come "
-                    "back by itself)")
+            return "no bus: the controller is bus-off (`sudo ip link set can0 type can restart` restarts it)"
         return ""
 
 

@@ -75,7 +75,7 @@ def main(args: argparse.Namespace) -> int:
     with bus.patience():
         warm_up_companion(configs, protocol)
     with bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port, \
-            Link(port, lambda: bus.open_bus(args)) as link, \
+            Link(port, lambda: bus.open_bus(args), transmits=args.transmit) as link, \
             recording.recordings(args, link, configs, protocol) as tap:
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
                             None if args.no_reconnect else link)

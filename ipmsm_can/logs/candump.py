@@ -1,8 +1,9 @@
-"""candump's text (`candump -L`), compiled: characters to rows of frames, and back.
+"""candump's text (`candump -L` or `-l`), compiled: characters to rows of frames, and back.
 
     (1700000000.000000) can0 123#0102030405060708        classical; 8 digits before '#': extended, or an error frame
     (1700000000.000000) can0 123#R4                      remote
     (1700000000.000000) can0 123##1AABB                  CAN FD, one digit of flags
+    (1700000000.000000)  can0  123   [8]  01 02 03 ...   for people, `candump -ta`; [08] with two digits: CAN FD
 
 The fraction may have any number of digits; what follows the payload (R or T, a raw DLC) is passed over.
 Lines that begin with '#' are comments, as for can-utils; `marks` are among them.
@@ -46,7 +47,8 @@ def read_candump(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
     outcome.done = 1.0
     if counts[1] and not counts[0] and not request.channel:
         raise LogError(f"{request.path} is no candump log: none of its {counts[1]} lines reads like "
-                       "'(1700000000.000000) can0 123#0102'")
+                       "'(1700000000.000000) can0 123#0102'; `candump -l can0` writes such lines, and those of "
+                       "`candump -ta can0` can be read, too")
     if filling.rows:
         yield filling.take()
 
@@ -120,6 +122,43 @@ def _parse_payload(text: NDArray[np.uint8], at: int, end: int, row: NDArray[np.u
 
 
 @kernel
+def _parse_columns(text: NDArray[np.uint8], at: int, end: int, row: NDArray[np.uint8]) -> int:
+    """Read what stands behind the identifier for people, "  [2]  AA BB", into a row; position after it, or -1."""
+    while at < end and text[at] <= 32:
+        at += 1
+    if at == end or text[at] != 91:  # '['
+        return -1
+    at += 1
+    length = 0
+    digits = 0
+    while at < end and 48 <= text[at] <= 57 and digits < 2:
+        length = 10 * length + (text[at] - 48)
+        at += 1
+        digits += 1
+    room = 8
+    if digits == 2:
+        row[5] = 0x04
+        room = 64
+    if digits == 0 or length > room or at == end or text[at] != 93:  # ']'
+        return -1
+    at += 1
+    row[4] = length
+    for k in range(length):
+        while at < end and text[at] <= 32:
+            at += 1
+        if k == 0 and at < end and text[at] == 114:  # "remote request"
+            row[3] |= 0x40
+            break
+        high = _nibble(text[at]) if at + 1 < end else -1
+        low = _nibble(text[at + 1]) if at + 1 < end else -1
+        if high < 0 or low < 0:
+            return -1
+        row[8 + k] = 16 * high + low
+        at += 2
+    return end  # the same as characters, or the word ERRORFRAME, may follow
+
+
+@kernel
 def _parse_line(text: NDArray[np.uint8], at: int, end: int, channel: NDArray[np.uint8],
                 row: NDArray[np.uint8]) -> tuple[int, int]:
     """One line without its newline: (kind, time in ns).
@@ -171,7 +210,11 @@ def _parse_line(text: NDArray[np.uint8], at: int, end: int, channel: NDArray[np.
         can_id = 16 * can_id + _nibble(text[at])
         at += 1
         digits += 1
-    if not 1 <= digits <= 8 or at == end or text[at] != 35:  # '#'
+    if not 1 <= digits <= 8 or at == end:
+        return -1, 0
+    # with times since the last frame (-td) or the start (-tz) it is not known when it was
+    columns = text[at] <= 32 and seconds >= 1_000_000_000
+    if text[at] != 35 and not columns:  # '#'
         return -1, 0
     if digits <= 3:
         can_id &= 0x7FF
@@ -183,7 +226,7 @@ def _parse_line(text: NDArray[np.uint8], at: int, end: int, channel: NDArray[np.
         row[k] = 0
     for k in range(4):
         row[k] = (can_id >> (8 * k)) & 0xFF
-    at = _parse_payload(text, at + 1, end, row)
+    at = _parse_columns(text, at, end, row) if columns else _parse_payload(text, at + 1, end, row)
     if at < 0 or (at < end and text[at] > 32):
         return -1, 0
     return (1 if wanted else 0), t_ns

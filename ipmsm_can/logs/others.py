@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ipmsm_can.bus.pythoncan import block_from_messages
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs.marks import from_comments, note
+from ipmsm_can.logs.savvycan import csv_reader
 from ipmsm_can.logs.source import LogError, Outcome, Request, Source, unpacked_file, words_of
 
 if TYPE_CHECKING:
@@ -38,8 +39,8 @@ def read_other(request: Request, outcome: Outcome) -> Iterator[FrameBlock]:
         return
     with Source(request.path, request.packed) as source:
         lines = _WholeLines(source, outcome)
-        yield from _blocks(lambda: _asc_reader(lines) if request.kind == ".asc" else reader(lines), request,
-                           outcome, source)
+        opening = {".asc": _asc_reader, ".csv": csv_reader}.get(request.kind, reader)
+        yield from _blocks(lambda: opening(lines), request, outcome, source)
         if lines.rest:
             outcome.problem = outcome.problem or (
                 f"{request.path} is cut off: its last line has no end and is left out")

@@ -112,7 +112,7 @@ def _fast(survey: Survey) -> Ability:
     if slow:
         return Ability(name, False, slow)
     if survey.usable < _SHARE_NEEDED * survey.rows:
-        return Ability(name, False, f"only {_share(survey.usable, survey.rows)} of the samples have current and "
+        return Ability(name, False, f"{_few(survey.usable, survey.rows)} of the samples have current and "
                        "voltage in the stationary frame")
     apart = max(survey.quality[1], survey.quality[2])
     if apart > _SHARE_NEEDED * survey.rows:
@@ -137,7 +137,7 @@ def _steady(survey: Survey) -> Ability:
         rest = "; speed, current and torque can be watched" if survey.rows else ""
         return Ability(name, False, f"the map has not {' and not '.join(lacks)}{rest}")
     if survey.dq < _SHARE_NEEDED * survey.rows or not survey.rows:
-        return Ability(name, False, f"only {_share(survey.dq, survey.rows)} of the samples have current, voltage "
+        return Ability(name, False, f"{_few(survey.dq, survey.rows)} of the samples have current, voltage "
                        "and speed in the rotor's frame, reported near enough in time")
     return Ability(name, True, f"{survey.dq} samples with current, voltage and speed in the rotor's frame")
 
@@ -218,6 +218,10 @@ def _value(c: Channel, value: float) -> str:
 
 def _share(part: int, whole: int) -> str:
     return f"{100.0 * part / whole:.1f} %" if whole else "none"
+
+
+def _few(part: int, whole: int) -> str:
+    return f"only {_share(part, whole)}" if part else "none"
 
 
 def _hertz(turning: float) -> str:

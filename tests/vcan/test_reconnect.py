@@ -232,3 +232,102 @@ def test_the_commands_go_on_and_say_so(vcan7: str, tmp_path: Path) -> None:
         assert "SILENT (listening only) no bus since" in said and f"{vcan7} is down" in said, said
         assert "went away once, for " in said, said
         assert process.returncode == ends, said  # no samples came; an outage is a finding of severity error
+
+
+# <linux/can/error.h>: CAN_ERR_FLAG with CAN_ERR_BUSOFF, CAN_ERR_RESTARTED
+BUS_OFF, RESTARTED = 0x20000040, 0x20000100
+
+
+def error_frame(can_id: int) -> FrameBlock:
+    block = FrameBlock.zeros(1)
+    block.raw[0, :4] = np.frombuffer(can_id.to_bytes(4, "little"), np.uint8)
+    block.raw[0, 4] = 8
+    return block
+
+
+def is_down(link: Link) -> bool:
+    """Asked anew: a type checker takes an attribute to stay as it was asserted to be."""
+    return link.down
+
+
+@pytest.mark.parametrize("transmit", [True, False])
+def test_bus_off_is_told_a_restart_tried_and_the_way_back_found(vcan7: str, transmit: bool) -> None:
+    """A vcan has no controller to restart, and the kernel says so; the drive's samples stop with the bus-off."""
+    config = config_from({"motor": {"preset": "m2"}})
+    warm_up_companion([config], PROTOCOL)
+    frames = traffic(4.0)
+    laps: list[int] = []
+    blocks: list[FrameBlock] = []
+    port = SocketCanPort(vcan7)
+    with Link(port, lambda: SocketCanPort(vcan7), transmits=transmit) as link, SocketCanPort(vcan7) as other:
+        runner = LiveRunner(port, Companion([config], PROTOCOL, transmit=transmit), 1e6, 5e6, link)
+        if runner._lane is not None:
+            run = runner._lane.run
+
+            def counted(timeout_s: float, now_ns: int) -> Lap:
+                lap = run(timeout_s, now_ns)
+                laps.append(len(lap.taken))
+                return lap
+
+            runner._lane.run = counted  # type: ignore[method-assign]
+        stop = False
+
+        def drive(seconds: float, at: int) -> int:
+            begin = time.monotonic_ns() - int(frames.t_ns[at])
+            until = int(frames.t_ns[at]) + round(1e9 * seconds)
+            while int(frames.t_ns[at]) < until:
+                time.sleep(0.003)
+                end = int(np.searchsorted(frames.t_ns, min(time.monotonic_ns() - begin, until)))
+                other.send(frames.take(slice(at, end)))
+                other.receive(0.0)
+                at = end
+            return at
+
+        thread = threading.Thread(target=lambda: runner.run(lambda: stop, lambda b, *_: blocks.append(b)))
+        thread.start()
+        try:
+            at = drive(1.0, 0)
+            assert not is_down(link) and (sum(laps) > 100) is transmit
+            other.send(error_frame(BUS_OFF))
+            time.sleep(0.6)
+            sent = runner.sent
+            assert is_down(link) and "the controller of vcan7 is bus-off" in link.words
+            said = ("the kernel cannot restart a controller of this kind; `sudo ip link set vcan7 down`" if transmit
+                    else "only listens and restarts nothing; `sudo ip link set vcan7 type can restart` does")
+            assert said in link.words
+            assert link.recovery.refused == int(transmit)
+            time.sleep(0.3)
+            assert runner.sent == sent and link.recovery.refused == int(transmit)
+            other.send(error_frame(RESTARTED))
+            deadline = time.monotonic() + 20
+            while is_down(link) and time.monotonic() < deadline:
+                time.sleep(0.02)
+            assert not is_down(link)
+            drive(1.0, at)
+            time.sleep(0.3)
+        finally:
+            stop = True
+            thread.join(20)
+        assert link.port is port and len(link.past) == link.outages == 1 and "bus-off" in link.past[0].reason
+        assert (runner.sent > sent) is transmit
+    numbers = FrameBlock.concat(blocks)
+    told = numbers.words[numbers.can_id == REFERENCE, 1].tolist()
+    assert told == list(range(len(told))) and len(told) > 300  # 200 a second
+
+
+def test_bus_off_ends_where_the_interface_is_taken_down_and_up(vcan7: str) -> None:
+    """What an administrator does; there is no frame that tells of it."""
+    with SocketCanPort(vcan7) as port, SocketCanPort(vcan7) as other, \
+            Link(port, lambda: SocketCanPort(vcan7)) as link:
+        other.send(error_frame(BUS_OFF))
+        assert len(port.receive(1.0)) == 1
+        with pytest.raises(BusError, match="bus-off") as off:
+            port.receive(0.0)
+        link.lose(off.value)
+        assert not link.retry()
+        ip("link", "set", vcan7, "down")
+        link.take()
+        assert not link.retry() and f"{vcan7} is down" in link.words
+        ip("link", "set", vcan7, "up")
+        link.take()
+        assert link.retry() and link.port is port and port.send(FrameBlock.zeros(1)) == 1
