@@ -7,8 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from ipmsm_can.config import parse_config
+from ipmsm_can.bus.cosim import CoSimulation
+from ipmsm_can.companion import Companion
+from ipmsm_can.config import config_from, parse_config
 from ipmsm_can.config.build import estimator_settings
+from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
@@ -17,6 +20,7 @@ from ipmsm_can.estimation.observers import common, riccati, voltage_errors
 from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.motor import M1, M2
 from ipmsm_can.startup import Phase, StartUp, StartUpSettings
+from ipmsm_can.wire.protocol import Protocol
 from ipmsm_can.wire.sequence import Events, SampleSequencer
 from ipmsm_can.wire.sequence_kernel import FILLED_S, NIBBLE, TIMING
 
@@ -112,3 +116,37 @@ def test_a_rotor_that_stood_still_may_have_crept_on_in_a_gap() -> None:
     assert after(150).sigma == pytest.approx(math.hypot(math.radians(3.0), crept))
     assert after(150).phase is Phase.KNOWN
     assert after(1000).phase is Phase.WATCH
+
+
+def test_lost_samples_take_the_volts_of_a_step_of_the_current_with_them() -> None:
+    """A straight line stands in for eight samples in which the current went from 5 A to nothing."""
+    track = Profile(((0.0, 80.0), (0.6, 80.0)), ((0.0, 4.5), (0.4, 4.5), (0.4, 0.0)), 0.6)
+    drive = DriveParameters(sample_rate=RATE, speed_imposed=True, current_bandwidth=400.0, current_noise=0.01)
+    s = DriveSimulation(M1, drive, track, 0.3).run(3000)
+    samples = np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+    config = parse_config('[motor]\npreset = "m1"\n')
+    current = np.hypot(samples[0], samples[1])
+    first = int(np.flatnonzero(current[1900:] < 0.97 * current[1900])[0]) + 1900
+    lost = np.arange(first, first + 8)
+    cut = samples.copy()
+    for row in cut:
+        row[lost] = np.interp(lost, [first - 1, first + 8], row[[first - 1, first + 8]])
+    for given, least, most in ((samples, 0.0, 2.0), (cut, 8.0, 90.0)):
+        out = Estimator(M1, RATE, estimator_settings(config, RATE)).process(given)
+        error = np.abs(np.degrees(np.angle(np.exp(1j * (out.angle[0] - s.theta_e)))))[first - 5:first + 60]
+        assert least < error.max() < most
+        assert (error < 2.0 * np.degrees(out.sigma[first - 5:first + 60]) + 1.0).all()
+    assert not (out.flags[lost[4:]] & confidence.VALID).any()
+
+
+def test_the_length_of_the_active_flux_holds_while_a_standing_rotor_is_probed() -> None:
+    """What the regression says of it there is wrong, and shrank it by half within a second."""
+    track = Profile(((0.0, 0.0),), ((0.0, 0.0),), 2.0)
+    drive = DriveParameters(sample_rate=RATE, saturation=0.2, rotor_locked=True, dead_time_voltage=0.5)
+    companion = Companion([config_from({"motor": {"preset": "m1"}})], Protocol(), transmit=True)
+    node = DriveNode(Protocol(), 0, DriveSimulation(M1, drive, track, 0.7, 2), DriveNodeSettings())
+    tracked = CoSimulation([node], companion).run(2.0).tracked[0]
+    length = np.abs(np.concatenate([t.estimate.flux[2] + 1j * t.estimate.flux[3] for t in tracked]))
+    flags = np.concatenate([t.estimate.flags for t in tracked])
+    assert (flags[2500:] & confidence.VALID).all()
+    assert length[2500:] == pytest.approx(M1.psi_m, rel=0.15)
