@@ -196,7 +196,7 @@ def injection(**keys: Any) -> dict[str, Any]:
 
 def test_injection_from_low_speed_to_high() -> None:
     track = Profile(((0.0, 20 * RPM), (2.5, 20 * RPM), (3.5, 500 * RPM)), duration=4.5)
-    b = bench(injection(current_limit=5.0), track)
+    b = bench(injection(current_limit=5.0, amplitude=6.0, frequency=400.0, ramp=60.0), track)
     scheduler = b.node.scheduler
     told: list[tuple[InjectionState, InjectionReason]] = []
     for _ in range(450):
@@ -234,7 +234,8 @@ def test_injection_is_seen_in_the_status_frames() -> None:
 
 
 def test_current_limit_cuts_the_amplitude_back() -> None:
-    b = bench(injection(current_limit=0.15), constant(20 * RPM, duration=4.0), current_noise=0.0)
+    limited = injection(current_limit=0.15, amplitude=6.0, frequency=400.0)
+    b = bench(limited, constant(20 * RPM, duration=4.0), current_noise=0.0)
     b.run(0.5)
     assert b.node.scheduler.state is InjectionState.LIMITED
     assert b.node.scheduler.reason is InjectionReason.CURRENT_LIMIT

@@ -132,6 +132,7 @@ def test_the_probing_that_a_report_asks_for_satisfies_c3_and_half_of_it_does_not
                     parameters=replace(drive.parameters, current_noise=0.02, saturation=0.0,
                                        dead_time_voltage=0.0))
     told = campaign.config(drive)
+    told = told.model_copy(update={"injection": told.injection.model_copy(update={"frequency": 400.0})})
     simulation = DriveSimulation(drive.true, drive.parameters, drive.profile, 0.3, 1)
     # 0.5 V for 0.1 s, and the noise of 20 mA through L_s/dt in 250 means of two samples; 3 sigma of its scatter.
     level = 0.5**2 * 0.1 + 2.0 * (drive.plate.L_s / 4e-4 * 0.02) ** 2 * 0.1 * (1.0 + 3.0 * (3.0 / 250.0) ** 0.5)

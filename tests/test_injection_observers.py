@@ -11,6 +11,7 @@ import pytest
 
 from ipmsm_can import estimate
 from ipmsm_can.config import ConfigError, parse_config
+from ipmsm_can.config.build import estimator_settings
 from ipmsm_can.estimation import confidence
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
 from ipmsm_can.estimation.observers.common import window_length
@@ -215,4 +216,4 @@ def test_frequency_from_the_call_and_from_the_file() -> None:
     text = '[motor]\npreset = "m2"\n[observer]\nkind = "injection_extraction"\n[wire]\nsample_rate = 10000\n'
     with pytest.raises(ConfigError, match=r"injection\.frequency is 15; allowed is a frequency from 19\.5312 Hz"):
         parse_config(text + "[injection]\nfrequency = 15\nenabled = false\n")
-    assert parse_config(text).injection.frequency == 400.0
+    assert estimator_settings(parse_config(text), 10_000.0).injection_frequency == 400.0
