@@ -267,8 +267,8 @@ def _probing(record: Record, end: float, loads: tuple[Mark, ...]) -> Panel:
              Line(record.time, obeyed, "obeyed", "the drive says that it injects"))
     bands = (Band(x, np.zeros_like(y), y, "probe"),)
     return Panel("probing", "The probing voltage is on at low speed and off at speed",
-                 "Amplitude that the companion asks the drive to add to its voltage, at 400 Hz unless configured "
-                 "otherwise; cut back where it would drive too much current.",
+                 "Amplitude that the companion asks the drive to add to its voltage, at a sixth of the sample rate "
+                 "unless configured otherwise; cut back where it would drive too much current.",
                  "V peak", _from_zero(max(1.0, float(y.max(initial=0.0)))), 0.0, end, 0.55, lines, bands,
                  loads=loads)
 
