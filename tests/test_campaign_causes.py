@@ -16,7 +16,7 @@ from ipmsm_can.drive.profile import Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.estimation.estimator import Estimator
-from ipmsm_can.estimation.observers import common, riccati, voltage_errors
+from ipmsm_can.estimation.observers import common, handover, voltage_errors
 from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.motor import M1, M2
 from ipmsm_can.startup import Phase, StartUp, StartUpSettings
@@ -33,7 +33,7 @@ def test_what_was_learned_of_the_voltage_at_the_wrong_end_is_forgotten() -> None
     state["P"][0] = 1e-6 * np.eye(7)
     state["bias"][0] = 0.1, -0.2, 0.9, 0.3, 0.4
     prior = np.array([0.01, 0.01, 0.25, 0.02, 0.09])
-    riccati.take_angle(state, 0.59, prior, -0.59 + 0j, 0.59 + 0j, 0.05)
+    handover.take_angle(state, 0.59, prior, -0.59 + 0j, 0.59 + 0j, 0.05)
     assert np.array_equal(state["bias"][0], np.zeros(5))
     assert np.array_equal(state["P"][0][2:, 2:], np.diag(prior))
     assert not state["P"][0][:2, 2:].any()

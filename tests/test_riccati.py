@@ -18,7 +18,7 @@ from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence, regression
 from ipmsm_can.estimation.estimator import EstimateBlock, Estimator
-from ipmsm_can.estimation.observers import common, covariance, kinds, riccati, voltage_errors
+from ipmsm_can.estimation.observers import common, covariance, handover, kinds, riccati, voltage_errors
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
 from ipmsm_can.motor import M1, M2, Motor
 from tests.probed import injection, locked_rotor
@@ -424,7 +424,7 @@ def test_an_angle_from_outside_is_weighed_as_the_textbook_says() -> None:
     state["P"][0], state["polarity"] = P, 1
     state["bias"] = bias = rng.normal(size=(1, common.FLUX_STATES - 2))
     x, theta, sigma = 0.55 * cmath.exp(0.7j), 0.75, 0.03
-    moved = riccati.take_angle(state, 0.59, np.ones(5), x, 0.6 * cmath.exp(1j * theta), sigma)
+    moved = handover.take_angle(state, 0.59, np.ones(5), x, 0.6 * cmath.exp(1j * theta), sigma)
     h = np.zeros(common.FLUX_STATES)
     h[:2] = -math.sin(theta), math.cos(theta)
     after = np.linalg.inv(np.linalg.inv(P) + np.outer(h, h) / (abs(x) * sigma) ** 2)

@@ -13,7 +13,7 @@ from ipmsm_can._jit import kernel
 from ipmsm_can.estimation import confidence, excitation, regression, speed, timing
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
-from ipmsm_can.estimation.observers import common, riccati
+from ipmsm_can.estimation.observers import common, handover, riccati
 from ipmsm_can.estimation.observers.dispatch import observer_block
 from ipmsm_can.estimation.observers.kinds import KINDS, MODULO_PI, RICCATI
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
@@ -221,7 +221,7 @@ class Estimator:
         north = complex(math.cos(theta), math.sin(theta))
         measured = (self._assumed.psi_m + self._assumed.L_0 * (i * north.conjugate()).real) * north
         if kind == RICCATI:
-            x += riccati.take_angle(self._observer, self._assumed.psi_m, self._observer_parameters[0]["prior"], x,
+            x += handover.take_angle(self._observer, self._assumed.psi_m, self._observer_parameters[0]["prior"], x,
                                     measured, sigma)
         else:
             x += confidence.take_angle(self._confidence, x, measured, sigma)
@@ -298,5 +298,5 @@ class Estimator:
             fresh["pll_theta"] = pll["theta"]
             fresh["x_a"], fresh["x_b"] = old["x_a"], old["x_b"]
             if own:
-                riccati.carry_over(self._observer, fresh, turned, doubt**2 + drift**2)
+                handover.carry_over(self._observer, fresh, turned, doubt**2 + drift**2)
         self._observer = fresh

@@ -13,6 +13,9 @@ from ipmsm_can.estimation.observers.voltage_errors import BIASES
 
 Floats = NDArray[np.float64]
 
+ANGLE_KNOWN = 0.1
+"""Variance of the angle [rad^2] below which d and the voltage errors are taken at the estimate."""
+
 
 @kernel
 def across(P: Floats, x_a: float, x_b: float) -> float:

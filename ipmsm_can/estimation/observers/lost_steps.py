@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers.covariance import across
+from ipmsm_can.estimation.observers.covariance import ANGLE_KNOWN, across
 
 Floats = NDArray[np.float64]
 
 _SHARE = 0.25
 """What wrong inductances, speed and voltage may make of a step that was not lost, as a share of its parts."""
 _STRAIGHT = 1e-9
-_ANGLE_KNOWN = 0.1
+"""What rounding makes of a straight line, relative."""
 _HUGE = 1e100
 
 
@@ -56,7 +56,7 @@ def left_out(di_a: float, di_b: float, moved_a: float, moved_b: float, straight:
     x2 = x_a * x_a + x_b * x_b
     before2 = st.off_a * st.off_a + st.off_b * st.off_b
     first = before2 == 0.0
-    known = x2 > p.epsilon * p.epsilon and across(st.P, x_a, x_b) < _ANGLE_KNOWN * x2
+    known = x2 > p.epsilon * p.epsilon and across(st.P, x_a, x_b) < ANGLE_KNOWN * x2
     if straight and known:
         salient = p.L_0 * (x_a * di_a + x_b * di_b) / x2
         turned = p.T_s * st.pll_omega

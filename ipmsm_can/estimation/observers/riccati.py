@@ -52,7 +52,7 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
-from ipmsm_can.estimation.observers.covariance import across, correct, limit, voltage_variance
+from ipmsm_can.estimation.observers.covariance import ANGLE_KNOWN, across, correct, limit, voltage_variance
 from ipmsm_can.estimation.observers.lost_steps import left_out, straight_on
 from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, near_zero, predict, rounded
 from ipmsm_can.estimation.speed import follow
@@ -81,58 +81,7 @@ _LOST_ABOVE = 9.0
 _FITS_BELOW = 4.0
 _POLARITY_SHARE = 0.25
 _POLARITY_LOST = math.radians(45.0)
-_ANGLE_KNOWN = 0.1
-"""Variance of the angle [rad^2] below which d and the voltage errors are taken at the estimate."""
 _HUGE = 1e100
-
-
-def carry_over(old: NDArray[np.void], fresh: NDArray[np.void], turned: float, variance: float) -> None:
-    """What a gap leaves: the covariance, turned [rad] with the rotor and widened [Wb^2], and the voltage errors.
-
-    old, fresh: record arrays (1,) of `common.STATE` before and after the gap.
-    """
-    c, s = math.cos(turned), math.sin(turned)
-    turn = np.eye(FLUX_STATES)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    P = turn @ old["P"][0] @ turn.T
-    P[0, 0] += variance
-    P[1, 1] += variance
-    fresh["P"][0] = 0.5 * (P + P.T)
-    aa, ab, bb = old["clear"][0]
-    clear = turn[:2, :2] @ np.array([[aa, ab], [ab, bb]]) @ turn[:2, :2].T
-    fresh["clear"][0] = (clear[0, 0] + variance, clear[0, 1], clear[1, 1] + variance)
-    for name in ("bias", "test", "polarity", "lost"):
-        fresh[name] = old[name]
-
-
-def take_angle(state: NDArray[np.void], psi_m: float, prior: Floats, x_hat: complex, measured: complex,
-               sigma: float) -> complex:
-    """Take in an active flux measured by its direction, polarity known: as `confidence.take_angle`.
-
-    state: record array (1,) of `common.STATE`; prior: variances of the voltage errors, float64 (BIASES,); psi_m,
-    x_hat, measured [Wb]; sigma: 1-sigma of the direction [rad
-    electrical].  Returns what x_hat has to be put right by [Wb].
-    """
-    st = state[0]
-    P = st["P"]
-    north = measured / abs(measured)
-    if not st["polarity"]:
-        # What was learned of the voltage with the rotor taken to be elsewhere, by half a turn as a rule, is wrong.
-        across2, along2 = (psi_m * sigma) ** 2, (MODEL_ERROR * psi_m) ** 2
-        P[:] = 0.0
-        P[2:, 2:] = np.diag(prior)
-        st["bias"] = 0.0
-        P[0, 0] = along2 * north.real**2 + across2 * north.imag**2
-        P[1, 1] = along2 * north.imag**2 + across2 * north.real**2
-        P[0, 1] = P[1, 0] = (along2 - across2) * north.real * north.imag
-        st["polarity"], st["test"] = 1, 1.0
-        return measured - x_hat
-    row, gain = np.zeros(FLUX_STATES), np.zeros(FLUX_STATES)
-    row[:2] = -north.imag, north.real
-    off = (north * x_hat.conjugate()).imag  # how far x_hat would have to move across the measured direction
-    correct(P, row, gain, (abs(x_hat) * sigma) ** 2 + 1e-24 * psi_m * psi_m)
-    st["bias"] += gain[2:] * off
-    return complex(gain[0], gain[1]) * off
 
 
 @kernel
@@ -331,7 +280,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         angle2 = 2.0
         if x2 > epsilon * epsilon:
             angle2 = min(across(P, x_a, x_b) / x2, 2.0)
-        known = angle2 < _ANGLE_KNOWN
+        known = angle2 < ANGLE_KNOWN
 
         # The measurement's row, its prediction and its noise.
         innovation = y - (phi_a * x_a + phi_b * x_b) + ell_alpha * (s - (open_s + p.present * s))
