@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st_
+from numpy.typing import NDArray
 
 from ipmsm_can.bus.cosim import CoSimulation
 from ipmsm_can.companion import Companion
@@ -16,7 +19,7 @@ from ipmsm_can.drive.profile import Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.estimation.estimator import Estimator
-from ipmsm_can.estimation.observers import common, handover, voltage_errors
+from ipmsm_can.estimation.observers import common, covariance, handover, lost_steps, voltage_errors
 from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.motor import M1, M2
 from ipmsm_can.startup import Phase, StartUp, StartUpSettings
@@ -30,11 +33,11 @@ RATE = 5000.0
 def test_what_was_learned_of_the_voltage_at_the_wrong_end_is_forgotten() -> None:
     """The polarity turned out to be the other one: the voltage errors found with it were its excuse."""
     state = common.new_state(0.0, 0.0, 0.0)
-    state["P"][0] = 1e-6 * np.eye(7)
-    state["bias"][0] = 0.1, -0.2, 0.9, 0.3, 0.4
-    prior = np.array([0.01, 0.01, 0.25, 0.02, 0.09])
+    state["P"][0] = 1e-6 * np.eye(9)
+    state["bias"][0] = 0.1, -0.2, 0.9, 0.3, 0.4, 0.01, -0.01
+    prior = np.array([0.01, 0.01, 0.25, 0.02, 0.09, 1e-4, 1e-4])
     handover.take_angle(state, 0.59, prior, -0.59 + 0j, 0.59 + 0j, 0.05)
-    assert np.array_equal(state["bias"][0], np.zeros(5))
+    assert np.array_equal(state["bias"][0], np.zeros(7))
     assert np.array_equal(state["P"][0][2:, 2:], np.diag(prior))
     assert not state["P"][0][:2, 2:].any()
     assert state["P"][0][1, 1] == pytest.approx((0.59 * 0.05) ** 2)
@@ -49,9 +52,30 @@ def test_the_shape_of_dead_time_counts_for_phases_near_zero_current() -> None:
         shares = np.minimum(np.abs(phases) / 0.1, 1.0) * np.maximum(0.0, 1.0 - np.abs(phases) / 0.5)
         near = np.maximum(0.0, 1.0 - np.abs(phases) / 0.1)
         assert voltage_errors.near_zero(i.real, i.imag, 0.1, 0.5) == pytest.approx(
-            4.0 / 9.0 * (shares**2 + near**2).sum())
-    assert voltage_errors.near_zero(5.0, 2.0, 0.1, 0.5) == 0.0
-    assert voltage_errors.near_zero(0.0, 0.0, 0.1, 0.5) == pytest.approx(4.0 / 3.0)
+            (4.0 / 9.0 * (shares**2).sum(), 4.0 / 9.0 * (near**2).sum()))
+    assert voltage_errors.near_zero(5.0, 2.0, 0.1, 0.5) == (0.0, 0.0)
+    assert voltage_errors.near_zero(0.0, 0.0, 0.1, 0.5) == pytest.approx((0.0, 4.0 / 3.0))
+
+
+@given(st_.floats(0.0, 0.7), st_.floats(-math.pi, math.pi), st_.floats(-1.0, 1.0), st_.floats(-0.5, 0.5))
+def test_the_dead_time_of_a_wrong_current_is_that_of_another_current(size: float, angle: float, dead: float,
+                                                                    late: float) -> None:
+    """B_5 and B_6 against the difference that a small offset makes of B_2 and B_4."""
+    i, zone, corner, step = size * np.exp(1j * angle), 0.1, 0.5, 1e-6
+    phases = np.abs(np.real(i * np.exp(-2j * math.pi / 3.0 * np.arange(3))))
+    assume(all(np.abs(phases - edge).min() > 1e-5 for edge in (zone, corner)))
+
+    def lost(i_a: float, i_b: float) -> NDArray[np.float64]:
+        B = np.zeros((7, 2))
+        voltage_errors.directions(i_a, i_b, zone, B)
+        voltage_errors.rounded(i_a, i_b, corner, B)
+        return np.asarray(dead * B[2] + late * B[4], np.float64)
+
+    B = np.zeros((7, 2))
+    voltage_errors.shifted(i.real, i.imag, zone, corner, dead, late, B)
+    for row, (d_a, d_b) in ((5, (step, 0.0)), (6, (0.0, step))):
+        expected = (lost(i.real - d_a, i.imag - d_b) - lost(i.real + d_a, i.imag + d_b)) / (2.0 * step)
+        assert B[row] == pytest.approx(expected, abs=1e-6)
 
 
 def test_an_acceleration_that_ends_in_a_gap_is_allowed_for() -> None:
@@ -99,8 +123,50 @@ def test_an_angle_has_to_be_surer_at_standstill_and_surer_still_to_become_valid(
         return int(flags[-1])
 
     said = [bool(judge(share, omega) & confidence.VALID) for share, omega in (
-        (0.7, 0.0), (0.5, 0.0), (0.7, 0.0), (0.8, 0.0), (0.7, 0.0), (0.9, 50.0), (0.7, 0.0))]
-    assert said == [False, True, True, False, False, True, True]
+        (0.7, 0.0), (0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 0.0), (0.9, 50.0), (0.8, 50.0), (0.95, 50.0),
+        (0.8, 0.0))]
+    assert said == [False, True, True, False, False, False, True, True, True]
+
+
+def test_an_angle_put_right_at_standstill_is_no_speed() -> None:
+    """A drive in closed loop would answer the speed of a correction with torque, and drop its load."""
+    settings = estimator_settings(parse_config('[motor]\npreset = "m2"\n'), RATE)
+    estimator = Estimator(M2, RATE, settings)
+    still = np.zeros((4, 500))
+    estimator.take_angle(0.3, math.radians(2.0))
+    estimator.process(still)
+    estimator.take_angle(0.4, math.radians(0.5))
+    out = estimator.process(still[:, :200])
+    assert 0.35 < out.angle[0, 0] < 0.41
+    assert np.abs(out.angle[1] - out.angle[0]).max() < 1e-3
+    assert np.abs(out.angle[2]).max() < 0.1  # rad/s electrical
+
+
+def test_an_angle_has_to_be_sure_for_a_while_before_it_is_valid() -> None:
+    limit = math.radians(7.5)
+    state = confidence.new_state(M2, 100.0, 0.06, 0.5, 0.02, limit, RATE, KINDS["riccati"])
+    n = 500
+    regression, flux, speed = np.zeros((7, n)), np.zeros((7, n)), np.zeros((3, n))
+    flux[5], flux[6] = 0.5 * limit, common.FITS + common.POLARITY
+    flux[5, 120] = 1.1 * limit
+    flux[5, 200:210] = 0.0  # surer does not make it longer
+    flux[5, 300:320] = 1.1 * limit
+    flags = np.empty(n, np.uint8)
+    confidence.confidence_block(regression, flux, speed, state, np.empty(n), flags)
+    valid = flags & confidence.VALID != 0
+    first = np.flatnonzero(np.diff(valid.astype(int), prepend=0) == 1)
+    hold = round(0.005 * RATE)
+    assert first[1:].tolist() == [121 + hold, 320 + hold]
+    assert not valid[:hold].any() and not valid[120] and not valid[300:320].any()
+    again = confidence.new_state(M2, 100.0, 0.06, 0.5, 0.02, limit, RATE, KINDS["riccati"])
+    parts = []
+    for at in range(0, n, 7):
+        part = np.empty(min(7, n - at), np.uint8)
+        cut = slice(at, at + part.size)
+        confidence.confidence_block(np.ascontiguousarray(regression[:, cut]), np.ascontiguousarray(flux[:, cut]),
+                                    np.ascontiguousarray(speed[:, cut]), again, np.empty(part.size), part)
+        parts.append(part)
+    assert np.array_equal(np.concatenate(parts), flags)
 
 
 def test_a_rotor_that_stood_still_may_have_crept_on_in_a_gap() -> None:
@@ -131,8 +197,8 @@ def test_lost_samples_take_the_volts_of_a_step_of_the_current_with_them() -> Non
     cut = samples.copy()
     for row in cut:
         row[lost] = np.interp(lost, [first - 1, first + 8], row[[first - 1, first + 8]])
-    for given, least, most in ((samples, 0.0, 2.0), (cut, 8.0, 90.0)):
-        out = Estimator(M1, RATE, estimator_settings(config, RATE)).process(given)
+    for told, least, most in ((samples, 0.0, 2.0), (cut, 8.0, 90.0)):
+        out = Estimator(M1, RATE, estimator_settings(config, RATE)).process(told)
         error = np.abs(np.degrees(np.angle(np.exp(1j * (out.angle[0] - s.theta_e)))))[first - 5:first + 60]
         assert least < error.max() < most
         assert (error < 2.0 * np.degrees(out.sigma[first - 5:first + 60]) + 1.0).all()
@@ -150,3 +216,63 @@ def test_the_length_of_the_active_flux_holds_while_a_standing_rotor_is_probed() 
     flags = np.concatenate([t.estimate.flags for t in tracked])
     assert (flags[2500:] & confidence.VALID).all()
     assert length[2500:] == pytest.approx(M1.psi_m, rel=0.15)
+
+
+def test_what_the_probing_signal_moves_within_lost_samples_is_counted() -> None:
+    """Seven of twenty samples of a period are a straight line: the volts between its arc and its chord."""
+    rate, lost = 10_000.0, 7
+    p = common.parameters(KINDS["riccati"], M1, 100.0, 1.0, 1e-3, rate, current_noise=0.02)[0]
+    state = common.new_state(M1.psi_m, 0.0, 0.0)
+    st = state[0]
+    st["x_a"] = M1.psi_m
+    st["P"][0, 0] = st["P"][1, 1] = (0.5 * M1.psi_m) ** 2  # an angle that is roughly known, to 29 deg
+    turn = 2.0 * math.pi * 500.0 / rate
+    voltage = 6.6 * np.exp(1j * turn * np.arange(40))  # mean over the interval that a sample ends
+    inductance = np.array([M1.L_d, M1.L_q])
+    moved = voltage / rate
+    change = moved.real / inductance[0] + 1j * moved.imag / inductance[1]
+    current = 5.0j + np.cumsum(change)
+    at = np.arange(40)
+    gap = at[20:20 + lost]
+    ends = [gap[0] - 1, gap[-1] + 1]
+    line_v, line_i = (np.where(np.isin(at, gap), np.interp(at, ends, x[ends].real)
+                               + 1j * np.interp(at, ends, x[ends].imag), x) for x in (voltage, current))
+    # of the flux, by the line's own volts and by the machine's
+    missing = abs(moved[gap[0]:ends[1] + 1].sum() - line_v[gap[0]:ends[1] + 1].sum() / rate)
+
+    def counted(v: NDArray[np.complex128], i: NDArray[np.complex128]) -> float:
+        samples = np.ascontiguousarray([i.real, i.imag, v.real, v.imag])
+        total = 0.0
+        for k in at:
+            straight = lost_steps.straight_on(samples, int(k), st)
+            di = i[k] - i[k - 1] if k else 0j
+            total += lost_steps.left_out(di.real, di.imag, v[k].real / rate, v[k].imag / rate, straight, st, p)
+        return math.sqrt(total)
+
+    assert missing > 0.01 * M1.psi_m, "else it shows nothing"
+    assert counted(voltage, current) == 0.0
+    assert counted(line_v, line_i) == pytest.approx(missing, rel=0.2)
+    st["P"][0, 0] = st["P"][1, 1] = (2.0 * M1.psi_m) ** 2  # with no angle there is no inductance either
+    assert counted(line_v, line_i) == 0.0
+
+
+def test_saturation_by_the_load_is_in_sigma() -> None:
+    """A machine that gives way as `uncertainty.saturation` says: what it was told of L_q is wrong under load."""
+    track = Profile(((0.0, 100.0), (0.6, 100.0)), ((0.0, 0.0), (0.2, 1.15 * M1.rated_torque)), 0.6)
+    drive = DriveParameters(sample_rate=RATE, speed_imposed=True, saturation=0.2)
+    s = DriveSimulation(M1, drive, track, 0.3).run(3000)
+    samples = np.ascontiguousarray([s.i_alpha, s.i_beta, s.v_alpha, s.v_beta])
+    settings = estimator_settings(parse_config('[motor]\npreset = "m1"\n'), RATE)
+    out = Estimator(M1, RATE, settings).process(samples)
+    error = np.degrees(np.abs(np.angle(np.exp(1j * (out.angle[0] - s.theta_e)))))[2500:]
+    sigma = np.degrees(out.sigma)[2500:]
+    assert error.mean() > 4.0, "else it shows nothing"
+    assert (error < 2.0 * sigma).all() and sigma.max() < 6.0
+    # By hand, where nothing else is wrong: L_q i_q/psi_m times the share that the law gives.
+    p = common.parameters(KINDS["riccati"], M1, 100.0, 1.0, 1e-3, RATE, current_noise=0.0,
+                          uncertainty=voltage_errors.Uncertainty(current=0.0, inductance=0.0, saturation=0.3))[0]
+    rated = M1.rated_current
+    for i_q in (rated, 0.5 * rated):
+        share = 0.5 * 0.3 * (i_q / rated) ** 3
+        assert covariance.angle_sigma(np.zeros((9, 9)), M1.psi_m, 0.0, i_q**2, p) == pytest.approx(
+            M1.L_q * i_q * share / M1.psi_m)

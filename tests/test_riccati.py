@@ -45,11 +45,11 @@ def regressed(samples: np.ndarray, motor: Motor, alpha: float) -> np.ndarray:
 
 def test_prediction_is_f_p_ft_plus_q() -> None:
     rng = np.random.default_rng(1)
-    root = rng.normal(size=(7, 7))
+    root = rng.normal(size=(9, 9))
     P = root @ root.T
-    B = rng.normal(size=(5, 2))
-    keep, prior = np.array([0.9, 0.8, 0.7, 0.95, 0.6]), np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    F = np.eye(7)
+    B = rng.normal(size=(7, 2))
+    keep, prior = np.array([0.9, 0.8, 0.7, 0.95, 0.6, 0.5, 0.4]), np.arange(1.0, 8.0)
+    F = np.eye(9)
     F[:2, 2:] = 0.01 * B.T
     F[2:, 2:] = np.diag(keep)
     expected = F @ P @ F.T + np.diag([0.5, 0.5, *((1.0 - keep**2) * prior)])
@@ -61,12 +61,12 @@ def test_prediction_is_f_p_ft_plus_q() -> None:
 @pytest.mark.parametrize("noise", [1e-9, 1.0, 1e9])
 def test_correction_is_josephs(noise: float) -> None:
     rng = np.random.default_rng(2)
-    root = rng.normal(size=(7, 7))
-    P, h, gain = root @ root.T, rng.normal(size=7), np.empty(7)
+    root = rng.normal(size=(9, 9))
+    P, h, gain = root @ root.T, rng.normal(size=9), np.empty(9)
     before = P.copy()
     seen = covariance.correct(P, h, gain, noise)
     k = before @ h / (h @ before @ h + noise)
-    left = np.eye(7) - np.outer(k, h)
+    left = np.eye(9) - np.outer(k, h)
     assert seen == pytest.approx(h @ before @ h)
     assert np.allclose(gain, k, rtol=1e-12)
     assert np.allclose(P, left @ before @ left.T + noise * np.outer(k, k), atol=1e-12 * before.max())
@@ -81,7 +81,7 @@ def test_two_states_are_the_textbook_filter() -> None:
     machine = Rotating(SURFACE, 120.0, 0.0, 2.0)
     rng = np.random.default_rng(3)
     samples = np.ascontiguousarray(machine.samples(RATE, n) + rng.normal(0, [[0.02]] * 2 + [[0.2]] * 2, (4, n)))
-    out, _ = riccati_on(samples, SURFACE, adapt_voltage=False, adapt_resistance=False)
+    out, _ = riccati_on(samples, SURFACE, adapt_voltage=False, adapt_resistance=False, saturation_uncertainty=0.0)
     y, phi, step, h = (lambda r: (r[0], r[1:3], r[3:5], r[5:7]))(regressed(samples, SURFACE, alpha))
     lam, P, T_s, psi = np.zeros(2), 4.0 * SURFACE.psi_m**2 * np.eye(2), 1.0 / RATE, SURFACE.psi_m
     found, trust = [], []
@@ -137,7 +137,7 @@ def test_a_voltage_error_stands_in_the_regression_as_said(state: int, size: floa
         p["prior"], p["keep"] = 0.0, 1.0
         flux = complex(machine.flux(0.0))
         state_ = common.new_state(flux.real, flux.imag, 0.0)
-        state_["P"][0] = np.diag([1e-12, 1e-12, 0, 0, 0, 0, 0])
+        state_["P"][0] = np.diag([1e-12, 1e-12, *[0.0] * 7])
         state_["bias"][0, state] = told
         out = np.empty((common.ROWS, n))
         riccati.riccati_block(samples, regressed(samples, M2, alpha), p, state_, out)
@@ -424,7 +424,7 @@ def test_an_angle_from_outside_is_weighed_as_the_textbook_says() -> None:
     state["P"][0], state["polarity"] = P, 1
     state["bias"] = bias = rng.normal(size=(1, common.FLUX_STATES - 2))
     x, theta, sigma = 0.55 * cmath.exp(0.7j), 0.75, 0.03
-    moved = handover.take_angle(state, 0.59, np.ones(5), x, 0.6 * cmath.exp(1j * theta), sigma)
+    moved = handover.take_angle(state, 0.59, np.ones(voltage_errors.BIASES), x, 0.6 * cmath.exp(1j * theta), sigma)
     h = np.zeros(common.FLUX_STATES)
     h[:2] = -math.sin(theta), math.cos(theta)
     after = np.linalg.inv(np.linalg.inv(P) + np.outer(h, h) / (abs(x) * sigma) ** 2)

@@ -37,7 +37,7 @@ That is the theory of `ges`; of the other observers it describes
                           While the rotor turns, what is wrong with voltage and motor data points everywhere in
                           turn, and 2 sigma are rarely passed; at standstill all of it may stay at its worst and
                           point the same way, 3 sigma and more.  So an angle has to be surer to be valid there, and
-                          surer still to become so
+                          surer still, and for a while, to become so
     injection_*           nothing: they bring the 1-sigma of their own fit, to which |w| times the age of the angle
                           is added.  They see an axis, not its north: polarity is not known unless `take_angle`
                           has told them; and none of their angles is valid, for a single window may be far off
@@ -78,10 +78,13 @@ _FORGIVEN = 1.0
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
-_SLOW_ENTERS, _SLOW_STAYS = 0.6, 0.75
-"""Share of the largest valid 1-sigma at which an angle becomes valid at standstill, and up to which it stays so."""
+_SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.87
+"""Share of the largest valid 1-sigma at which an angle becomes valid at standstill and at speed, and up to which it
+stays so at standstill; at speed it stays up to all of it."""
 _FAST_EMF = 8.0
-"""Back-EMF over the voltage's uncertainty from which on both are all of it."""
+"""Back-EMF over the voltage's uncertainty from which on the rotor counts as fast."""
+_SURE = 0.005
+"""Time [s] for which an angle has to be sure before it is valid: the first samples that it fits are no proof."""
 _CALMING = 0.1
 """Time constant [s] of the speed that counts for becoming valid: an angle put right looks like a turning rotor."""
 
@@ -99,7 +102,7 @@ STATE = np.dtype([
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
     # riccati: losses of lock that are not yet forgotten, for how long [s] nothing is valid, and what was said last.
-    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"), ("calm", "f8"),
+    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"), ("calm", "f8"), ("sure", "f8"),
 ])
 
 
@@ -142,7 +145,7 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
 
 def forget(state: NDArray[np.void]) -> None:
     """Give up lock, polarity and covariance: the next sample starts from nothing."""
-    for name in ("started", "test", "contraction", "locked", "polarity", "valid"):
+    for name in ("started", "test", "contraction", "locked", "polarity", "valid", "sure"):
         state[name] = 0
 
 
@@ -230,6 +233,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     probation = st.probation
     valid = st.valid
     calm = st.calm
+    sure = st.sure
     steadying = 1.0 - math.exp(-st.T_s / _CALMING)
     for k in range(flux.shape[1]):
         s = flux[5, k]
@@ -259,12 +263,18 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
         polarity = 1 if opinion & POLARITY else 0
         sigma[k] = s
         calm += steadying * (omega - calm)
-        limit = st.sigma_limit
-        share = _SLOW_STAYS if valid else _SLOW_ENTERS
         turning = abs(omega) if valid else min(abs(omega), abs(calm))
-        if st.psi_m * turning < _FAST_EMF * st.volts:
-            limit *= share + (1.0 - share) * st.psi_m * turning / (_FAST_EMF * st.volts)
-        valid = 1 if locked and polarity and s <= limit and probation == 0.0 else 0
+        fast = min(st.psi_m * turning / max(_FAST_EMF * st.volts, 1e-9), 1.0)
+        if valid:
+            share = _SLOW_STAYS + (1.0 - _SLOW_STAYS) * fast
+        else:
+            share = _SLOW_ENTERS + (_FAST_ENTERS - _SLOW_ENTERS) * fast
+        if not (locked and polarity and s <= share * st.sigma_limit and probation == 0.0):
+            sure = 0.0
+            valid = 0
+        else:
+            sure += st.T_s
+            valid = 1 if valid or sure > _SURE else 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
     st.test = test
     st.locked = locked
@@ -273,6 +283,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     st.probation = probation
     st.valid = valid
     st.calm = calm
+    st.sure = sure
 
 
 @kernel

@@ -13,7 +13,7 @@ from ipmsm_can._jit import kernel
 from ipmsm_can.estimation import confidence, excitation, regression, speed, timing
 from ipmsm_can.estimation.confidence import confidence_block
 from ipmsm_can.estimation.excitation import excitation_block
-from ipmsm_can.estimation.observers import common, handover, riccati
+from ipmsm_can.estimation.observers import common, forgetting, handover
 from ipmsm_can.estimation.observers.dispatch import observer_block
 from ipmsm_can.estimation.observers.kinds import KINDS, MODULO_PI, RICCATI
 from ipmsm_can.estimation.observers.voltage_errors import Uncertainty
@@ -218,6 +218,7 @@ class Estimator:
         unknown = not self.polarity_known
         i = complex(r["i_a"], r["i_b"])
         x = complex(o["lambda_a"], o["lambda_b"]) - self._assumed.L_q * i
+        before = x
         north = complex(math.cos(theta), math.sin(theta))
         measured = (self._assumed.psi_m + self._assumed.L_0 * (i * north.conjugate()).real) * north
         if kind == RICCATI:
@@ -231,13 +232,18 @@ class Estimator:
             o["kick_a"] = o["kick_b"] = 0.0
             pll["theta"] = pll["theta_hat"] = o["pll_theta"] = o["pll_hat"] = math.atan2(x.imag, x.real)
             pll["omega"] = pll["omega_difference"] = o["pll_omega"] = o["pll_difference"] = 0.0
+        else:
+            # An angle put right is no rotation: the loops go on from it with the speed that they had.
+            moved = math.atan2((x * before.conjugate()).imag, (x * before.conjugate()).real)
+            for record, name in ((pll, "theta"), (pll, "theta_hat"), (o, "pll_theta"), (o, "pll_hat")):
+                record[name] = math.remainder(float(record[name]) + moved, 2.0 * math.pi)
         common.stand_still(self._observer, i, complex(r["fi_a"], r["fi_b"]), x, self.settings.epsilon)
 
     def doubt(self) -> None:
         """Give up all trust in the angle, but not the angle: it has to be found anew from the samples to come."""
         confidence.forget(self._confidence)
         if KINDS[self.settings.kind] == RICCATI:
-            riccati.doubt(self._observer_parameters, self._observer)
+            forgetting.doubt(self._observer_parameters, self._observer)
 
     def _segment(self, samples: Floats, out: EstimateBlock) -> None:
         estimate_block(samples, self._regression_parameters, self._regression, self._observer_parameters,

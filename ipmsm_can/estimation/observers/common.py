@@ -37,7 +37,7 @@ PARAMETERS = np.dtype([
     ("pole", "f8"), ("scheduled", "i8"),
     # riccati: 1-sigma of what is uncertain [V], [ohm], share of L_q; states of the voltage's error.
     ("L_d", "f8"), ("L_0", "f8"), ("residual", "f8"), ("residual_R", "f8"), ("volts", "f8"), ("spread_R", "f8"),
-    ("spread_L", "f8"), ("zone", "f8"), ("corner", "f8"), ("rated", "f8"), ("tilt", "f8"),
+    ("spread_L", "f8"), ("zone", "f8"), ("corner", "f8"), ("rated", "f8"), ("tilt", "f8"), ("saturated", "f8"),
     ("prior", "f8", (BIASES,)), ("keep", "f8", (BIASES,)),
 ])
 
@@ -57,6 +57,7 @@ STATE = np.dtype([
     ("P", "f8", (FLUX_STATES, FLUX_STATES)), ("bias", "f8", (BIASES,)),
     ("unit", "f8", (BIASES, 2)), ("product", "f8", (BIASES,)), ("f_product", "f8", (BIASES,)),
     ("square", "f8"), ("f_square", "f8"), ("off_a", "f8"), ("off_b", "f8"),
+    ("usual", "f8"), ("missed", "f8"),
     ("last", "f8", (4,)), ("step", "f8", (4,)),
     ("i_a", "f8"), ("i_b", "f8"), ("memory", "f8"), ("clear", "f8", (3,)), ("test", "f8"),
     ("polarity", "i8"), ("lost", "i8"),
@@ -124,7 +125,7 @@ def parameters(kind: int, motor: Motor, alpha: float, gamma: float, epsilon: flo
         "L_d": motor.L_d, "L_0": motor.L_0, "residual": u.residual, "residual_R": u.residual_resistance(motor),
         "volts": u.voltage,
         "spread_R": u.resistance * motor.R, "spread_L": u.inductance, "zone": u.dead_zone(motor),
-        "corner": u.corner(motor), "rated": motor.rated_current, "tilt": u.tilt,
+        "corner": u.corner(motor), "rated": motor.rated_current, "tilt": u.tilt, "saturated": u.saturated,
         "prior": u.priors(motor), "keep": keeps(sample_rate),
     }
     for name, value in values.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,15 @@ def across(P: Floats, x_a: float, x_b: float) -> float:
     """Variance of the flux [Wb^2] across x."""
     total = x_b * x_b * P[0, 0] - 2.0 * x_a * x_b * P[0, 1] + x_a * x_a * P[1, 1]
     return float(max(total, 0.0) / (x_a * x_a + x_b * x_b))
+
+
+@kernel
+def angle_sigma(P: Floats, x_a: float, x_b: float, i_q2: float, p: Any) -> float:
+    """1-sigma of the angle of x_hat [rad electrical]; i_q2: the current across it, squared [A^2]."""
+    saturated = p.saturated * i_q2 * math.sqrt(i_q2) / (p.rated * p.rated * p.rated)
+    spread2 = (p.spread_L * p.spread_L + saturated * saturated) * i_q2
+    total = across(P, x_a, x_b) + p.L_q * p.L_q * (p.noise * p.noise + spread2)
+    return float(math.sqrt(total / (x_a * x_a + x_b * x_b)))
 
 
 @kernel

@@ -2,23 +2,26 @@
 
 Its currents are right, as its ends are.  Its voltage is the mean of the voltages at both ends; where a step of the
 current fell into the gap, the volts that drove it are missing, up to the dc link for a period: 15 to 20 deg on
-a motor with a weak magnet.  The currents tell: with x_hat known, so is the inductance, and
+a motor with a weak magnet.  Of the probing signal a part of a period is missing, small, but many times a second.
+The currents tell: with x_hat roughly known, so is the inductance, and
 
     what the flux moved by other than the voltage says      L di + j omega x T_s - (v - R i) T_s
 
-is added up as long as the line lasts, for it all points one way, and counts as an error of the flux, in P and,
-through the regression's filters, in y.
+is added up as long as the line lasts, for it all points one way.  Once it exceeds what wrong parameters and the
+noise of the line's ends make of it, it counts as an error of the flux, in P and, through the regression's filters,
+in y.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.observers.covariance import ANGLE_KNOWN, across
+from ipmsm_can.estimation.observers.covariance import across
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +29,10 @@ _SHARE = 0.25
 """What wrong inductances, speed and voltage may make of a step that was not lost, as a share of its parts."""
 _STRAIGHT = 1e-9
 """What rounding makes of a straight line, relative."""
+_NOISES = 2.0
+"""How many 1-sigmas of the current's noise the ends of the line may be off."""
+_ROUGHLY = 1.0
+"""Variance of the angle [rad^2] below which the inductance is known well enough."""
 _HUGE = 1e100
 
 
@@ -54,24 +61,25 @@ def left_out(di_a: float, di_b: float, moved_a: float, moved_b: float, straight:
     x_a = st.x_a
     x_b = st.x_b
     x2 = x_a * x_a + x_b * x_b
-    before2 = st.off_a * st.off_a + st.off_b * st.off_b
-    first = before2 == 0.0
-    known = x2 > p.epsilon * p.epsilon and across(st.P, x_a, x_b) < ANGLE_KNOWN * x2
+    first = st.usual == 0.0
+    known = x2 > p.epsilon * p.epsilon and across(st.P, x_a, x_b) < _ROUGHLY * x2
     if straight and known:
         salient = p.L_0 * (x_a * di_a + x_b * di_b) / x2
         turned = p.T_s * st.pll_omega
-        off_a = moved_a - p.L_q * di_a - salient * x_a + turned * x_b
-        off_b = moved_b - p.L_q * di_b - salient * x_b - turned * x_a
-        drawn2 = p.L_q * p.L_q * (di_a * di_a + di_b * di_b)
-        usual2 = (_SHARE * _SHARE * (drawn2 + moved_a * moved_a + moved_b * moved_b + turned * turned * x2)
-                  + 2.0 * (4.0 * p.L_q * p.noise) ** 2)
-        off2 = off_a * off_a + off_b * off_b
-        if usual2 < off2 < _HUGE:
-            # That it is a straight line shows at the second of its steps.
-            share = 2.0 if first else 1.0
-            st.off_a += share * off_a
-            st.off_b += share * off_b
-            return float(max(st.off_a * st.off_a + st.off_b * st.off_b - before2, 0.0))
+        # That it is a straight line shows at the second of its steps.
+        share = 2.0 if first else 1.0
+        st.off_a += share * (moved_a - p.L_q * di_a - salient * x_a + turned * x_b)
+        st.off_b += share * (moved_b - p.L_q * di_b - salient * x_b - turned * x_a)
+        parts2 = p.L_q * p.L_q * (di_a * di_a + di_b * di_b) + moved_a * moved_a + moved_b * moved_b
+        st.usual += share * _SHARE * math.sqrt(parts2 + turned * turned * x2)
+        off2 = st.off_a * st.off_a + st.off_b * st.off_b
+        if st.usual * st.usual + 2.0 * (_NOISES * p.L_q * p.noise) ** 2 < off2 < _HUGE:
+            more = max(off2 - st.missed, 0.0)
+            st.missed += more
+            return float(more)
+        return 0.0
     st.off_a = 0.0
     st.off_b = 0.0
+    st.usual = 0.0
+    st.missed = 0.0
     return 0.0

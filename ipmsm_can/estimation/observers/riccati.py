@@ -17,7 +17,8 @@ Noise, in physical units, nothing tuned.
                    as long as these do: it counts for a sixth of a radian of the rotor, at most LONGEST
     square         the regression holds the voltage's errors with their square (`voltage_errors`).  What they are
                    still wrong by multiplies the error of x_hat, which grew out of them: 2 e~^T x~, and
-                   e~^2/alpha, noise that lasts as long as the shape
+                   e~^2/alpha, noise that lasts as long as the shape.  Its mean, what x~ and e~ have in common by P,
+                   is taken off y
     lost samples   `lost_steps`
     length         at standstill y says next to nothing of the length of x_hat, and what it says of it under probing
                    is wrong: |x| = psi_m + L_0 i_d is measured, too, to LENGTH, the less the faster the rotor turns
@@ -29,7 +30,8 @@ Noise, in physical units, nothing tuned.
                    y, as long as the load lasts.  At speed it is small beside Phi; at standstill it limits probing
     y, memory      after a loss of lock Lemma 1 does not hold until the filters have forgotten: an error of at most
                    4 alpha psi_m^2 that dies out with exp(-alpha t), the paper's epsilon_t, coloured as well
-The angle's 1-sigma is the covariance across x_hat, the current noise L_q s_i, and dL i_q, each over |x_hat|.
+The angle's 1-sigma is the covariance across x_hat, the current noise L_q s_i, and dL i_q with what saturation may
+take from L_q, each over |x_hat|.
 
 Loss of lock.  The squared innovation over its variance and that of the length of x_hat against psi_m + L_0 i_d,
 whichever is larger, averaged over INNOVATION_TIME; beyond _LOST_ABOVE everything is forgotten but the flux itself.
@@ -52,9 +54,25 @@ from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
 from ipmsm_can.estimation.observers.common import FITS, FLUX_STATES, POLARITY, along
-from ipmsm_can.estimation.observers.covariance import ANGLE_KNOWN, across, correct, limit, voltage_variance
+from ipmsm_can.estimation.observers.covariance import (
+    ANGLE_KNOWN,
+    across,
+    angle_sigma,
+    correct,
+    limit,
+    voltage_variance,
+)
+from ipmsm_can.estimation.observers.forgetting import forget, start_over
 from ipmsm_can.estimation.observers.lost_steps import left_out, straight_on
-from ipmsm_can.estimation.observers.voltage_errors import BIASES, directions, near_zero, predict, rounded
+from ipmsm_can.estimation.observers.voltage_errors import (
+    BIASES,
+    SUMMED,
+    directions,
+    near_zero,
+    predict,
+    rounded,
+    shifted,
+)
 from ipmsm_can.estimation.speed import follow
 
 Floats = NDArray[np.float64]
@@ -85,32 +103,6 @@ _HUGE = 1e100
 
 
 @kernel
-def _forget(P: Floats, st: Any, p: Any, ceiling: float) -> None:
-    """Nothing is known any more but the priors."""
-    for a in range(FLUX_STATES):
-        for b in range(FLUX_STATES):
-            P[a, b] = 0.0
-    P[0, 0] = ceiling
-    P[1, 1] = ceiling
-    for j in range(BIASES):
-        P[2 + j, 2 + j] = p.prior[j]
-        st.bias[j] = 0.0
-    st.clear[0] = ceiling
-    st.clear[1] = 0.0
-    st.clear[2] = ceiling
-    st.test = 0.0
-    st.polarity = 0
-
-
-@kernel
-def doubt(parameters: NDArray[np.void], state: NDArray[np.void]) -> None:
-    """Nothing is known any more but the flux itself, as after a loss of lock; arguments as for `riccati_block`."""
-    p = parameters[0]
-    st = state[0]
-    _forget(st.P, st, p, 4.0 * p.psi_m * p.psi_m)
-
-
-@kernel
 def _filter_units(B: Floats, phi_a: float, phi_b: float, st: Any, p: Any) -> None:
     """F[B_j], F[Phi'^T F[B_j]] and F[e^2] after one interval; Phi' = Phi + 2 e, e = sum b_j F[B_j]."""
     e_a = 0.0
@@ -118,8 +110,9 @@ def _filter_units(B: Floats, phi_a: float, phi_b: float, st: Any, p: Any) -> Non
     for j in range(BIASES):
         st.unit[j, 0] = p.decay * st.unit[j, 0] + (1.0 - p.decay) * B[j, 0]
         st.unit[j, 1] = p.decay * st.unit[j, 1] + (1.0 - p.decay) * B[j, 1]
-        e_a += st.bias[j] * st.unit[j, 0]
-        e_b += st.bias[j] * st.unit[j, 1]
+        if j < SUMMED:
+            e_a += st.bias[j] * st.unit[j, 0]
+            e_b += st.bias[j] * st.unit[j, 1]
     square = e_a * e_a + e_b * e_b
     st.f_square = p.decay * st.f_square + p.previous * st.square + p.present * square
     st.square = square
@@ -205,24 +198,29 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         i2 = i_a * i_a + i_b * i_b
         residual2 = p.residual * p.residual + p.residual_R * p.residual_R * i2
         # Dead time as far as it is known: what it is taken for, and what it may be besides.
-        shape2 = SHAPE * SHAPE * (bias[2] * bias[2] + P[4, 4]) * near_zero(i_a, i_b, p.zone, p.corner)
+        shape, unknown = near_zero(i_a, i_b, p.zone, p.corner)
+        shape2 = SHAPE * SHAPE * (bias[2] * bias[2] * shape + P[4, 4] * (shape + unknown))
         holds = min(max(_SIXTH / max(abs(st.pll_omega), 1e-9), CORRELATION_TIME), LONGEST)
         begins = st.started == 0
         straight = straight_on(samples, k, st)
         if begins:
             st.started = 1
             if P[0, 0] == 0.0:
-                _forget(P, st, p, ceiling)
+                forget(P, st, p, ceiling)
         else:
             # While the voltage is held the back-EMF turns: i'' = L^-1 omega^2 x bends the current away.
             bend = (T_s * st.pll_omega) ** 2 / (12.0 * p.L_d)
-            directions(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.zone, B)
-            rounded(0.5 * (st.i_a + i_a) - bend * st.x_a, 0.5 * (st.i_b + i_b) - bend * st.x_b, p.corner, B)
+            flows_a = 0.5 * (st.i_a + i_a) - bend * st.x_a - bias[5]
+            flows_b = 0.5 * (st.i_b + i_b) - bend * st.x_b - bias[6]
+            directions(flows_a, flows_b, p.zone, B)
+            rounded(flows_a, flows_b, p.corner, B)
+            shifted(flows_a, flows_b, p.zone, p.corner, bias[2], bias[4], B)
             l_a += regression[3, k]
             l_b += regression[4, k]
             for j in range(BIASES):
-                l_a += T_s * B[j, 0] * bias[j]
-                l_b += T_s * B[j, 1] * bias[j]
+                if j < SUMMED:
+                    l_a += T_s * B[j, 0] * bias[j]
+                    l_b += T_s * B[j, 1] * bias[j]
                 bias[j] *= p.keep[j]
             missed = left_out(i_a - st.i_a, i_b - st.i_b, regression[3, k], regression[4, k], straight, st, p)
             st.memory += correlated * (2.0 * alpha * psi_m) ** 2 * missed
@@ -239,23 +237,8 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             # An absurd sample.  Start from no angle, and count on nothing until the filters have forgotten it.
             l_a = L_q * i_a if abs(i_a) < 1e9 else 0.0
             l_b = L_q * i_b if abs(i_b) < 1e9 else 0.0
-            _forget(P, st, p, ceiling)
-            st.s = 0.0
-            st.f_s = 0.0
-            st.u_a = 0.0
-            st.u_b = 0.0
-            st.f_u_a = 0.0
-            st.f_u_b = 0.0
-            st.square = 0.0
-            st.f_square = 0.0
-            for j in range(BIASES):
-                st.product[j] = 0.0
-                st.f_product[j] = 0.0
+            start_over(P, st, p, ceiling)
             st.memory = correlated * (4.0 * alpha * psi_m * psi_m) ** 2
-            st.x_a = 0.0
-            st.x_b = 0.0
-            st.pll_omega = 0.0
-            st.pll_difference = 0.0
             out[0, k] = l_a
             out[1, k] = l_b
             out[2, k] = 0.0
@@ -291,7 +274,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         w_a = 2.0 * x_a - (phi_a + L_0 * h_a) / alpha - L_0 * (i_a - h_a / alpha)
         w_b = 2.0 * x_b - (phi_b + L_0 * h_b) / alpha - L_0 * (i_b - h_b / alpha)
         if known:
-            for j in range(BIASES):
+            for j in range(SUMMED):
                 w_a -= 2.0 / alpha * bias[j] * unit[j, 0]
                 w_b -= 2.0 / alpha * bias[j] * unit[j, 1]
             innovation -= (st.square + st.f_square) / alpha
@@ -302,10 +285,12 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
             h[2 + j] = 0.0
             if known:
                 n = w_a * e_a + w_b * e_b - st.f_product[j] / alpha
-                innovation -= bias[j] * n
+                innovation -= 2.0 * (P[0, 2 + j] * e_a + P[1, 2 + j] * e_b)
                 h[2 + j] = n
-                h[0] += 2.0 * bias[j] * e_a
-                h[1] += 2.0 * bias[j] * e_b
+                if j < SUMMED:
+                    innovation -= bias[j] * n
+                    h[0] += 2.0 * bias[j] * e_a
+                    h[1] += 2.0 * bias[j] * e_b
             else:
                 volts2 += P[2 + j, 2 + j] * (e_a * e_a + e_b * e_b)
         if known:
@@ -372,10 +357,8 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         # What to think of it.
         sigma = math.pi
         if x2 > epsilon * epsilon:
-            across2 = across(P, x_a, x_b)
-            along2 = max(P[0, 0] + P[1, 1] - across2, 0.0)
-            i_q2 = max(i2 - s * s, 0.0)
-            sigma = math.sqrt((across2 + L_q * L_q * (p.noise * p.noise + p.spread_L * p.spread_L * i_q2)) / x2)
+            sigma = angle_sigma(P, x_a, x_b, max(i2 - s * s, 0.0), p)
+            along2 = max(P[0, 0] + P[1, 1] - across(P, x_a, x_b), 0.0)
             off = math.sqrt(x2) - (psi_m + L_0 * s)
             misfit = max(misfit, off * off / (along2 + (MODEL_ERROR * psi_m) ** 2))
         if not sigma < math.pi:
@@ -383,7 +366,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         st.test += smoothing * (min(misfit, 1e4) - st.test)
         if st.test > _LOST_ABOVE:
             st.lost += 1
-            _forget(P, st, p, ceiling)
+            forget(P, st, p, ceiling)
             st.memory = correlated * (4.0 * alpha * psi_m * psi_m) ** 2
             sigma = math.pi
         error2 = (16.0 / 9.0) * p.volts * p.volts + p.spread_R * p.spread_R * i2

@@ -1,6 +1,6 @@
-"""What may be wrong with the reported voltage, as signals that `riccati` can weigh: five states and their priors.
+"""What may be wrong with the reported voltage, as signals that `riccati` can weigh: seven states and their priors.
 
-    v_true = v_reported + sum over j of b_j B_j(t)
+    v_true = v_reported + sum over j < SUMMED of b_j B_j(t)
     B_0, B_1   the alpha and the beta axis: a lasting offset b [V] of the voltage or, through R, of a sensor
     B_2        against the current, phase by phase: dead time, b [V] lost by each phase.  It stands still in the
                rotor's frame for a whole half-period of each phase, so it is no noise: it is one unknown number
@@ -8,6 +8,9 @@
     B_4        B_2 with its corner at the largest current that it may have, less B_2 with it at the smallest: how
                much of the dead time begins later.  A wrong corner makes harmonics of the rotor's frequency, which
                B_2 alone would answer with a wrong dead time
+    B_5, B_6   an offset b [A] of the current sensors, alpha and beta: B_2 and B_4 are those of the current less the
+               offset, and these the derivative, -d(b_2 B_2 + b_4 B_4)/di.  At rest that looks like B_0 and B_1, but
+               it goes once a current flows, and without it the filter would call the dead time at rest nothing
 
 Each b is a Gauss-Markov process: its variance never exceeds its prior, and what nothing tells apart falls back to
 zero with the time constant.  So no rule is needed for what to adapt: the filter moves a state as far as the samples
@@ -34,12 +37,14 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.motor import Motor
 
-BIASES = 5
+BIASES = 7
+SUMMED = 5
+"""How many of them, from the first on, v_true is the sum of; the others move the current behind B_2 and B_4."""
 OFFSET_SHARE = 0.2
 """Lasting offset as a share of `voltage_uncertainty`, which dead time has for itself."""
 RESIDUAL_SHARE = 0.1
 """What none of these describes, as a share of `voltage_uncertainty`: dead time has corners that B_2 rounds."""
-_KEEPS = (10.0, 10.0, 10.0, 30.0, 10.0)
+_KEEPS = (10.0, 10.0, 10.0, 30.0, 10.0, 30.0, 30.0)
 """Time constants [s]: temperature moves all of them."""
 TILT = 3.0
 """That angle [rad electrical] over the share by which L_d falls at rated current, as `drive.magnetics` has it."""
@@ -52,6 +57,11 @@ CORNER_PRIOR = 0.6
 """1-sigma of B_4 as a share of the dead time's."""
 OFF = 1.0
 """What a wrong current makes of a phase at zero current, over what the rest of the shape makes elsewhere."""
+SENSOR_OFFSET = 0.75
+"""1-sigma of a current sensor's offset, per axis, over its noise."""
+SATURATED = 0.5
+"""1-sigma of the share by which rated current across the axis lowers L_q, the flux over the current, over the share
+by which L_d falls at rated current along it; with the cube of the current below, as `drive.magnetics` has it."""
 _HALF_SQRT3 = 0.5 * math.sqrt(3.0)
 
 
@@ -75,12 +85,18 @@ class Uncertainty:
         """1-sigma [rad electrical] of the angle between the rotor and the axis of saliency at rated current."""
         return TILT * self.saturation
 
+    @property
+    def saturated(self) -> float:
+        """1-sigma of the share by which L_q is lower at rated current than at none."""
+        return SATURATED * self.saturation
+
     def priors(self, motor: Motor) -> tuple[float, ...]:
-        """Prior variances of the five states [V^2, V^2, V^2, ohm^2, V^2]."""
+        """Prior variances of the seven states [V^2, V^2, V^2, ohm^2, V^2, A^2, A^2]."""
         offset = (OFFSET_SHARE * self.voltage) ** 2 if self.adapt_voltage else 0.0
         dead_time = self.voltage**2 if self.adapt_voltage else 0.0
         resistance = (self.resistance * motor.R) ** 2 if self.adapt_resistance else 0.0
-        return offset, offset, dead_time, resistance, CORNER_PRIOR**2 * dead_time
+        sensor = (SENSOR_OFFSET * self.current) ** 2 if self.adapt_voltage else 0.0
+        return offset, offset, dead_time, resistance, CORNER_PRIOR**2 * dead_time, sensor, sensor
 
     @property
     def residual(self) -> float:
@@ -136,25 +152,50 @@ def rounded(i_a: float, i_b: float, corner: float, B: NDArray[np.float64]) -> No
 
 
 @kernel
-def near_zero(i_a: float, i_b: float, zone: float, corner: float) -> float:
-    """Square of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
+def shifted(i_a: float, i_b: float, zone: float, corner: float, dead: float, late: float,
+            B: NDArray[np.float64]) -> None:
+    """Write B_5 and B_6: -d(dead B_2 + late B_4)/di.
+
+    dead, late: the states of B_2 and B_4 [V]; arguments as for `directions` and `rounded`.
+    """
+    a = _slope(i_a, zone, corner, dead, late)
+    b = _slope(-0.5 * i_a + _HALF_SQRT3 * i_b, zone, corner, dead, late)
+    c = _slope(-0.5 * i_a - _HALF_SQRT3 * i_b, zone, corner, dead, late)
+    B[5, 0] = (4.0 * a + b + c) / 6.0
+    B[5, 1] = (c - b) * _HALF_SQRT3 / 3.0
+    B[6, 0] = B[5, 1]
+    B[6, 1] = 0.5 * (b + c)
+
+
+@kernel
+def _slope(phase: float, zone: float, corner: float, dead: float, late: float) -> float:
+    """By how much [V/A] what a phase loses grows with its current."""
+    size = abs(phase)
+    return ((dead - late) / zone if size < zone else 0.0) + (late / corner if size < corner else 0.0)
+
+
+@kernel
+def near_zero(i_a: float, i_b: float, zone: float, corner: float) -> tuple[float, float]:
+    """Squares of the voltage vector [V^2] that an error of 1 V makes in each phase whose current is near zero.
 
     What a phase loses is odd in its current: at zero nobody doubts that it is nothing.  So its share rises up to
-    `zone`, the corner that B_2 assumes, and falls to 0 at the latest possible one, `corner` [A].  Within `zone` a
-    wrong current, as an offset of its sensor, makes as much again.  The phases' errors are independent.
+    `zone`, the corner that B_2 assumes, and falls to 0 at the latest possible one, `corner` [A].  The second: what
+    a wrong current makes, as long as it is no state, within `zone`.  The phases' errors are independent.
     """
-    total = 0.0
+    shape = 0.0
+    off = 0.0
     for phase in (i_a, -0.5 * i_a + _HALF_SQRT3 * i_b, -0.5 * i_a - _HALF_SQRT3 * i_b):
         share = min(abs(phase) / zone, 1.0) * max(0.0, 1.0 - abs(phase) / corner)
         slope = max(0.0, 1.0 - abs(phase) / zone)
-        total += share * share + OFF * OFF * slope * slope
-    return 4.0 / 9.0 * total
+        shape += share * share
+        off += slope * slope
+    return 4.0 / 9.0 * shape, 4.0 / 9.0 * OFF * OFF * off
 
 
 @kernel
 def predict(P: NDArray[np.float64], B: NDArray[np.float64], T_s: float, keep: NDArray[np.float64],
             prior: NDArray[np.float64], process: float) -> None:
-    """P (7, 7) of (lambda, b) over one interval: lambda += T_s B b, b *= keep; process: growth of lambda [Wb^2].
+    """P (9, 9) of (lambda, b) over one interval: lambda += T_s B b, b *= keep; process: growth of lambda [Wb^2].
 
     P becomes F P F^T + Q, symmetric to the last bit.
     """
