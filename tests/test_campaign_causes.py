@@ -149,15 +149,18 @@ def test_an_angle_has_to_be_sure_for_a_while_before_it_is_valid() -> None:
     regression, flux, speed = np.zeros((7, n)), np.zeros((7, n)), np.zeros((3, n))
     flux[5], flux[6] = 0.5 * limit, common.FITS + common.POLARITY
     flux[5, 120] = 1.1 * limit
-    flux[5, 200:210] = 0.0  # surer does not make it longer
-    flux[5, 300:320] = 1.1 * limit
+    flux[5, 200:210] = 1.1 * limit
+    flux[6, 300] = common.POLARITY  # no lock
+    flux[5, 400:450] = 1.1 * limit
     flags = np.empty(n, np.uint8)
     confidence.confidence_block(regression, flux, speed, state, np.empty(n), flags)
     valid = flags & confidence.VALID != 0
     first = np.flatnonzero(np.diff(valid.astype(int), prepend=0) == 1)
     hold = round(0.005 * RATE)
-    assert first[1:].tolist() == [121 + hold, 320 + hold]
-    assert not valid[:hold].any() and not valid[120] and not valid[300:320].any()
+    # sure again for as long as it was not, at most for the whole time; a lock that was lost has its own probation
+    locked = int(np.flatnonzero(flags & confidence.LOCKED)[0])
+    assert first.tolist() == [locked + hold, 121, 219]
+    assert not valid[120] and not valid[200:219].any() and not valid[300:].any()
     again = confidence.new_state(M2, 100.0, 0.06, 0.5, 0.02, limit, RATE, KINDS["riccati"])
     parts = []
     for at in range(0, n, 7):

@@ -269,12 +269,16 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             share = _SLOW_STAYS + (1.0 - _SLOW_STAYS) * fast
         else:
             share = _SLOW_ENTERS + (_FAST_ENTERS - _SLOW_ENTERS) * fast
-        if not (locked and polarity and s <= share * st.sigma_limit and probation == 0.0):
+        if not (locked and polarity and probation == 0.0):
             sure = 0.0
             valid = 0
-        else:
-            sure += st.T_s
+        elif s <= share * st.sigma_limit:
+            sure = min(sure + st.T_s, _SURE + st.T_s)
             valid = 1 if valid or sure > _SURE else 0
+        else:
+            # Too unsure for a moment, it has to be sure again for as long, no longer.
+            sure = max(sure - st.T_s, 0.0)
+            valid = 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
     st.test = test
     st.locked = locked

@@ -57,7 +57,7 @@ STATE = np.dtype([
     ("P", "f8", (FLUX_STATES, FLUX_STATES)), ("bias", "f8", (BIASES,)),
     ("unit", "f8", (BIASES, 2)), ("product", "f8", (BIASES,)), ("f_product", "f8", (BIASES,)),
     ("square", "f8"), ("f_square", "f8"), ("off_a", "f8"), ("off_b", "f8"),
-    ("usual", "f8"), ("missed", "f8"),
+    ("missed", "f8"),
     ("last", "f8", (4,)), ("step", "f8", (4,)),
     ("i_a", "f8"), ("i_b", "f8"), ("memory", "f8"), ("clear", "f8", (3,)), ("test", "f8"),
     ("polarity", "i8"), ("lost", "i8"),

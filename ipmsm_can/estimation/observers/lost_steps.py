@@ -7,14 +7,13 @@ The currents tell: with x_hat roughly known, so is the inductance, and
 
     what the flux moved by other than the voltage says      L di + j omega x T_s - (v - R i) T_s
 
-is added up as long as the line lasts, for it all points one way.  Once it exceeds what wrong parameters and the
-noise of the line's ends make of it, it counts as an error of the flux, in P and, through the regression's filters,
-in y.
+is added up as long as the line lasts, for it all points one way, and counts as an error of the flux, in P and,
+through the regression's filters, in y.  What wrong parameters and the noise of the line's ends make of it counts
+with it: where samples are missing that much doubt is due.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -25,12 +24,8 @@ from ipmsm_can.estimation.observers.covariance import across
 
 Floats = NDArray[np.float64]
 
-_SHARE = 0.25
-"""What wrong inductances, speed and voltage may make of a step that was not lost, as a share of its parts."""
 _STRAIGHT = 1e-9
 """What rounding makes of a straight line, relative."""
-_NOISES = 2.0
-"""How many 1-sigmas of the current's noise the ends of the line may be off."""
 _ROUGHLY = 1.0
 """Variance of the angle [rad^2] below which the inductance is known well enough."""
 _HUGE = 1e100
@@ -61,7 +56,7 @@ def left_out(di_a: float, di_b: float, moved_a: float, moved_b: float, straight:
     x_a = st.x_a
     x_b = st.x_b
     x2 = x_a * x_a + x_b * x_b
-    first = st.usual == 0.0
+    first = st.off_a == 0.0 and st.off_b == 0.0
     known = x2 > p.epsilon * p.epsilon and across(st.P, x_a, x_b) < _ROUGHLY * x2
     if straight and known:
         salient = p.L_0 * (x_a * di_a + x_b * di_b) / x2
@@ -70,16 +65,13 @@ def left_out(di_a: float, di_b: float, moved_a: float, moved_b: float, straight:
         share = 2.0 if first else 1.0
         st.off_a += share * (moved_a - p.L_q * di_a - salient * x_a + turned * x_b)
         st.off_b += share * (moved_b - p.L_q * di_b - salient * x_b - turned * x_a)
-        parts2 = p.L_q * p.L_q * (di_a * di_a + di_b * di_b) + moved_a * moved_a + moved_b * moved_b
-        st.usual += share * _SHARE * math.sqrt(parts2 + turned * turned * x2)
         off2 = st.off_a * st.off_a + st.off_b * st.off_b
-        if st.usual * st.usual + 2.0 * (_NOISES * p.L_q * p.noise) ** 2 < off2 < _HUGE:
+        if off2 < _HUGE:
             more = max(off2 - st.missed, 0.0)
             st.missed += more
             return float(more)
         return 0.0
     st.off_a = 0.0
     st.off_b = 0.0
-    st.usual = 0.0
     st.missed = 0.0
     return 0.0
