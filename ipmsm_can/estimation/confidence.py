@@ -78,7 +78,7 @@ _FORGIVEN = 1.0
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
-_SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.87
+_SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.8
 """Share of the largest valid 1-sigma at which an angle becomes valid at standstill and at speed, and up to which it
 stays so at standstill; at speed it stays up to all of it."""
 _FAST_EMF = 8.0
