@@ -282,9 +282,10 @@ def test_saturation_by_the_load_is_in_sigma() -> None:
 
 
 @pytest.mark.parametrize("theta_0", [0.0, 1.57, 3.9])
-def test_offsets_of_the_current_sensors_are_learned_and_their_dead_time_goes_with_the_idling(theta_0: float) -> None:
-    """Loaded, so that the dead time is known; idling, where the sensors' offsets make a quarter of it; then a load at
-    standstill, where nothing is seen of the angle and a wrong voltage would turn it away, surely."""
+def test_offsets_of_the_current_sensors_are_learned_and_so_is_their_dead_time(theta_0: float) -> None:
+    """Loaded, so that the dead time is known; idling, where the sensors' offsets make a quarter of it; then a load
+    at standstill, where nothing is seen of the angle and a wrong voltage would turn it away, surely.
+    """
     offset = (0.02, -0.02)
     track = Profile(((0.0, 55.0), (1.0, 55.0), (1.2, 0.0), (1.5, 0.0)),
                     ((0.0, 3.0), (0.4, 3.0), (0.4, 0.0), (1.2, 0.0), (1.2, 0.9 * M2.rated_torque)), 1.5)
