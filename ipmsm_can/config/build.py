@@ -31,7 +31,7 @@ SAMPLES_PER_PERIOD = 6
 _CURRENT_SHARE = 0.65
 """Share of the limit of the high-frequency current that `amplitude = "auto"` drives through L_d; the rest is for
 iron that saturates, and for noise in the measured current."""
-_RAMP_S = 0.05
+_RAMP_S = 0.1
 """Time [s] in which the amplitude rises to its largest where no ramp is given."""
 _HIGHEST = 4000.0
 _EMF_SHARE = 0.19

@@ -263,7 +263,7 @@ class InjectionConfig(Section):
         unit=units.EXCITATION, least=0)] = 0.0
     ramp: Annotated[float | None, Quantity(
         doc="Rate at which the amplitude rises and falls.", unit=units.VOLT_PER_SECOND, above=0,
-        default="the largest amplitude in 0.05 s", example="60 V/s")] = None
+        default="the largest amplitude in 0.1 s", example="60 V/s")] = None
     current_limit: Annotated[float | None, Quantity(
         doc="Limit of the high-frequency current; the amplitude is reduced to stay below it.",
         unit=units.AMPERE_PEAK, above=0,
