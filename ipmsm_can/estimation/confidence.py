@@ -81,7 +81,7 @@ _SPEED_ERROR = 0.5
 _SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.8
 """Share of the largest valid 1-sigma at which an angle becomes valid at standstill and at speed, and up to which it
 stays so at standstill; at speed it stays up to all of it."""
-_FAST_EMF = 8.0
+_FAST_EMF = 7.0
 """Back-EMF over the voltage's uncertainty from which on the rotor counts as fast."""
 _SURE = 0.005
 """Time [s] for which an angle has to be sure before it is valid: the first samples that it fits are no proof."""
