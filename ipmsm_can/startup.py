@@ -321,7 +321,9 @@ class StartUp:
         elif measured is not None and not math.isfinite(known_to):
             self.estimator.take_angle(self.angle, self.sigma)
         elif measured is not None and sigma < known_to:
-            self.estimator.take_angle(measured, sigma)
+            # The error of this window is that of the ones before: however many are taken in, they never come to
+            # more than the best of them.
+            self.estimator.take_angle(measured, sigma / math.sqrt(1.0 - (sigma / known_to) ** 2))
 
     # Changes of phase
 

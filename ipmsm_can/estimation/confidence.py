@@ -78,9 +78,10 @@ _FORGIVEN = 1.0
 _SPEED_ERROR = 0.5
 """How far the speed of the angle and that behind |Phi| may be apart, relative to the larger."""
 
-_SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.8
+_SLOW_ENTERS, _FAST_ENTERS, _SLOW_STAYS = 0.6, 0.87, 0.75
 """Share of the largest valid 1-sigma at which an angle becomes valid at standstill and at speed, and up to which it
-stays so at standstill; at speed it stays up to all of it."""
+stays so at standstill; at speed it stays up to all of it.  In between, entering goes with the speed, staying with
+its square: the errors of a slow rotor last as long as those of one that stands."""
 _FAST_EMF = 7.0
 """Back-EMF over the voltage's uncertainty from which on the rotor counts as fast."""
 _SURE = 0.005
@@ -266,7 +267,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
         turning = abs(omega) if valid else min(abs(omega), abs(calm))
         fast = min(st.psi_m * turning / max(_FAST_EMF * st.volts, 1e-9), 1.0)
         if valid:
-            share = _SLOW_STAYS + (1.0 - _SLOW_STAYS) * fast
+            share = _SLOW_STAYS + (1.0 - _SLOW_STAYS) * fast * fast
         else:
             share = _SLOW_ENTERS + (_FAST_ENTERS - _SLOW_ENTERS) * fast
         if not (locked and polarity and probation == 0.0):
