@@ -123,9 +123,13 @@ def test_the_receiver_agrees_with_the_vectors_of_the_c_library() -> None:
         if got is not None:
             assert got.sample % 2**32 == row["named"]
             assert got.theta_e == pytest.approx(row["theta_e"]) and got.omega_e == row["omega_e"]
-            good = row["valid"] and row["locked"] and row["polarity_known"]
-            expected = AngleVerdict.INVALID if not good else (
-                AngleVerdict.USABLE if row["sigma_theta"] <= 90.0 else AngleVerdict.UNCERTAIN)
+            certain = row["sigma_theta"] <= 90.0
+            if not (row["locked"] and row["polarity_known"]):
+                expected = AngleVerdict.INVALID
+            elif row["valid"]:
+                expected = AngleVerdict.USABLE if certain else AngleVerdict.UNCERTAIN
+            else:
+                expected = AngleVerdict.DOUBTFUL if certain else AngleVerdict.INVALID
             assert got.verdict == expected
 
 
@@ -203,7 +207,8 @@ def test_the_speed_controlled_is_the_estimated_one() -> None:
     assert rig.all("omega_e")[-1] / M2.pole_pairs == pytest.approx(600.0 * RPM / 1.05, rel=2e-3)
 
 
-@pytest.mark.parametrize("wrong", [{"valid": 0.0}, {"locked": 0.0}, {"polarity_known": 0.0},
+@pytest.mark.parametrize("wrong", [{"locked": 0.0}, {"polarity_known": 0.0}, {"valid": 0.0, "locked": 0.0},
+                                   {"valid": 0.0, "polarity_known": 0.0}, {"valid": 0.0, "sigma_theta": 10.5},
                                    {"sigma_theta": 10.5}, {"sigma_theta": 127.5}])
 def test_an_angle_that_may_not_be_used_stops_the_drive_at_once_and_for_good(wrong: dict[str, Any]) -> None:
     rig = Rig(**BOTH)
@@ -216,6 +221,19 @@ def test_an_angle_that_may_not_be_used_stops_the_drive_at_once_and_for_good(wron
     assert np.isnan(rig.all("control_theta")[at:]).all()
     assert np.abs(rig.all("torque")[at + 1:]).max() < 1e-9
     assert not rig.all("v_alpha")[at + 1:].any() and not rig.all("v_beta")[at + 1:].any()
+
+
+def test_an_angle_that_is_valid_no_more_is_kept_within_the_limit_and_begins_nothing() -> None:
+    rig = Rig(**BOTH)
+    rig.silence(WARM_UP)
+    rig.run(1000)
+    rig.run(500, valid=0.0, sigma_theta=10.0)
+    assert rig.changes == [(0, ENCODER), (FAILS, COMPANION)]
+    assert np.degrees(np.abs(rig.angle_error[FAILS:]).max()) < 0.1
+    other = Rig(**BOTH)
+    other.silence(WARM_UP)
+    other.run(1000, valid=0.0)
+    assert other.changes == [(0, ENCODER), (FAILS, STOPPED)]
 
 
 def test_silence_stops_the_drive_when_the_time_to_live_is_over() -> None:

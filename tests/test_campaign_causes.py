@@ -11,6 +11,7 @@ from hypothesis import strategies as st_
 from numpy.typing import NDArray
 
 from ipmsm_can.bus.cosim import CoSimulation
+from ipmsm_can.campaign import scenario, trial
 from ipmsm_can.companion import Companion
 from ipmsm_can.config import config_from, parse_config
 from ipmsm_can.config.build import estimator_settings
@@ -19,7 +20,7 @@ from ipmsm_can.drive.profile import Profile
 from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.estimation import confidence
 from ipmsm_can.estimation.estimator import Estimator
-from ipmsm_can.estimation.observers import common, covariance, handover, lost_steps, voltage_errors
+from ipmsm_can.estimation.observers import common, covariance, forgetting, handover, lost_steps, voltage_errors
 from ipmsm_can.estimation.observers.kinds import KINDS
 from ipmsm_can.motor import M1, M2
 from ipmsm_can.startup import Phase, StartUp, StartUpSettings
@@ -301,3 +302,51 @@ def test_offsets_of_the_current_sensors_are_learned_and_so_is_their_dead_time(th
     out = estimator.process(np.ascontiguousarray(samples[:, 6000:]))
     error = np.degrees(np.abs(np.angle(np.exp(1j * (out.angle[0] - s.theta_e[6000:])))))
     assert (error < 1.5 * np.degrees(out.sigma)).all()
+
+
+@given(st_.integers(0, 2**32 - 1), st_.floats(1.0, 1.5), st_.floats(0.5, 2.0))
+def test_doubt_makes_nothing_surer_and_no_voltage_error_larger_than_its_prior(seed: int, factor: float,
+                                                                             wide: float) -> None:
+    """What is left is a covariance, nowhere below the one before but where that was beyond the priors."""
+    root = np.random.default_rng(seed).standard_normal((9, 9))
+    before = root @ root.T / 9.0
+    parameters = np.zeros(1, [("prior", "f8", (7,))])
+    parameters["prior"] = wide * np.diag(before)[2:]
+    P = before.copy()
+    forgetting.fade(P, factor, parameters[0])
+    assert np.allclose(P, P.T)
+    assert np.linalg.eigvalsh(P).min() > -1e-12
+    assert np.allclose(np.diag(P)[:2], factor * np.diag(before)[:2])
+    assert np.allclose(np.diag(P)[2:], min(factor, wide) * np.diag(before)[2:])
+    P = before.copy()
+    forgetting.distrust(P, parameters[0])
+    assert np.linalg.eigvalsh(P - before).min() > -1e-12
+    assert np.allclose(np.diag(P)[2:], max(1.0, wide) * np.diag(before)[2:])
+    assert np.array_equal(P[:2, :], before[:2, :])
+
+
+def test_windows_that_are_wrong_alike_make_the_angle_no_surer_than_one_of_them() -> None:
+    estimator = Estimator(M2, RATE, estimator_settings(parse_config('[motor]\npreset = "m2"\n'), RATE))
+    start_up = StartUp(M2, estimator, StartUpSettings(frequency=400.0, current=2.0, amplitude=40.0))
+    estimator.take_angle(0.0, 0.2)
+    start_up.resume(0.0, 0.2)
+    state = estimator._observer[0]
+
+    def sigma() -> float:
+        x = float(state["x_a"]), float(state["x_b"])
+        return math.sqrt(covariance.across(state["P"], *x)) / math.hypot(*x)
+
+    assert sigma() == pytest.approx(0.2, rel=0.05)
+    for _ in range(50):
+        start_up._judge_known(True, sigma(), 0.1, 0.12)
+    assert 0.119 < sigma() < 0.125
+    assert 0.02 < math.atan2(state["x_b"], state["x_a"]) < 0.1
+
+
+@pytest.mark.parametrize("number", [436, 2130, 2861, 5187, 7318])
+def test_runs_of_the_campaign_that_were_wrong_once(number: int) -> None:
+    course = trial.simulate(scenario.draw(1, number))
+    error = np.abs(course.error[course.valid])
+    assert error.size > 1000
+    assert error.max() < trial.WRONG_DEG
+    assert (error / course.sigma[course.valid]).max() < 4.0

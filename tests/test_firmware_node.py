@@ -19,6 +19,7 @@ from ipmsm_can.config import config_from
 from ipmsm_can.drive import firmware_library
 from ipmsm_can.drive.angle_source import AngleState
 from ipmsm_can.drive.firmware import (
+    ANGLE_DOUBTFUL,
     ANGLE_INVALID,
     ANGLE_MISSING,
     ANGLE_USABLE,
@@ -207,7 +208,7 @@ def test_the_angle_is_used_while_the_companion_answers_and_refused_after() -> No
     assert (verdict[:1024] == ANGLE_MISSING).all()
     assert (verdict == ANGLE_INVALID).any()
     assert usable[7500:10_000].all()
-    assert np.array_equal(np.isnan(theta), ~usable)
+    assert np.array_equal(np.isnan(theta), ~(usable | (verdict == ANGLE_DOUBTFUL)))
     error = np.degrees(np.angle(np.exp(1j * (theta - truth))))[7500:10_000]
     assert np.abs(error).max() < 0.5
     # 50 samples are 10 ms; the last answer was to a sample at most a millisecond before the end.
@@ -218,23 +219,27 @@ def test_the_angle_is_used_while_the_companion_answers_and_refused_after() -> No
     assert counts.estimates.ok > 1900 and counts.estimates[1:] == (0, 0, 0, 0)
 
 
-def estimate(counter: int, sample: int, theta: float, omega: float) -> FrameBlock:
+def estimate(counter: int, sample: int, theta: float, omega: float, valid: bool = True) -> FrameBlock:
     kind = MessageKind.POSITION_ESTIMATE
     raw = PROTOCOL.encode(kind, 3, {
         "theta_e": PROTOCOL.angle(kind, "theta_e", theta), "omega_e": omega, "sample_counter": sample & 1023,
-        "sigma_theta": 4.0, "valid": 1.0, "locked": 1.0, "polarity_known": 1.0, "injecting": 0.0}, counter)
+        "sigma_theta": 4.0, "valid": float(valid), "locked": 1.0, "polarity_known": 1.0, "injecting": 0.0}, counter)
     return FrameBlock(raw, np.zeros(1, np.int64))
 
 
 @pytest.mark.parametrize("drive", [
     {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3},
+    {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3, "valid_until": 310},
+    {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3, "valid_until": 290},
     {"angle_source": "encoder_then_companion", "encoder_fails_at": 0.3, "angle_sigma_limit": 3.0},
     {"angle_source": "companion", "brake": True},
     {"angle_source": "companion", "estimate_time_to_live": 0.005, "open_loop_current": 2.0},
-], ids=["swap", "too uncertain", "wait", "silence"])
+], ids=["swap", "doubted later", "doubted before", "too uncertain", "wait", "silence"])
 def test_the_control_runs_on_what_the_library_says(drive: dict[str, Any]) -> None:
-    """The same estimates to both drives, the last 8 ms apart: the same states at the same samples, the same status
-    frames, and the same angle but for single precision."""
+    """The same estimates to both drives, the last 8 ms apart, from `valid_until` on not valid: the same states at
+    the same samples, the same status frames, and the same angle but for single precision."""
+    drive = dict(drive)
+    valid_until = drive.pop("valid_until", 400)
     found = []
     for kind in (DriveNode, FirmwareNode):
         node = kind(PROTOCOL, 3, simulated(5000.0, **drive), DriveNodeSettings())
@@ -242,7 +247,7 @@ def test_the_control_runs_on_what_the_library_says(drive: dict[str, Any]) -> Non
         for k in range(400):
             if k % 4 and k < 390:
                 now = node.simulation.next_sample
-                node.receive(estimate(k - k // 4, max(0, now - 4), 0.2 + 0.01 * now, 50.0))
+                node.receive(estimate(k - k // 4, max(0, now - 4), 0.2 + 0.01 * now, 50.0, k < valid_until))
             elif k == 395:
                 node.receive(estimate(k, 0, 0.0, 0.0))  # far too old
             steps.append(node.step(5))
@@ -254,7 +259,7 @@ def test_the_control_runs_on_what_the_library_says(drive: dict[str, Any]) -> Non
     used = ours["angle_state"] == AngleState.COMPANION
     apart = np.angle(np.exp(1j * (ours["control_theta"] - theirs["control_theta"])))
     assert np.abs(apart[used]).max(initial=0.0) < 1e-5
-    assert used.any() == ("angle_sigma_limit" not in drive)
+    assert used.any() == ("angle_sigma_limit" not in drive and valid_until != 290)
     assert np.abs(ours["omega_e"] - theirs["omega_e"]).max() < 0.5
     frames = [together(steps) for steps in found]
     kinds = [block.take(np.isin(block.can_id, [PROTOCOL.base_ids[k] + 3 for k in (

@@ -134,7 +134,7 @@ static void judge_angle(struct stub *stub)
         stub->verdict = verdict;
         report_angle(&stub->facts, verdict);
     }
-    if (verdict == IPMSM_ANGLE_USABLE) {
+    if (verdict == IPMSM_ANGLE_USABLE || verdict == IPMSM_ANGLE_DOUBTFUL) {
         const double error = fabs(remainder((double)theta_e - stub->machine.theta_e, TWO_PI)) * 360.0 / TWO_PI;
         stub->facts.usable++;
         stub->facts.error_deg = fmax(stub->facts.error_deg, error);

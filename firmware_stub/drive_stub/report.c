@@ -3,7 +3,7 @@
 #include <inttypes.h>
 #include <stdio.h>
 
-static const char *const verdicts[] = {"usable", "missing", "invalid", "uncertain"};
+static const char *const verdicts[] = {"usable", "missing", "invalid", "uncertain", "doubtful"};
 
 static void begin(const struct facts *facts, const char *event)
 {

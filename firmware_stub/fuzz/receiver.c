@@ -74,10 +74,13 @@ static void period(struct ipmsm_drive *drive, uint32_t *silent_for)
     *silent_for = renewed ? 0u : *silent_for + 1u;
     insist(*silent_for <= 5100u || (v_alpha == 0.0f && v_beta == 0.0f));
     insist(drive->probing.waveform <= IPMSM_WAVEFORM_POLARITY_PULSES);
-    if (ipmsm_drive_angle(drive, 1.5f, &theta_e) == IPMSM_ANGLE_USABLE) {
+    const enum ipmsm_angle_verdict verdict = ipmsm_drive_angle(drive, 1.5f, &theta_e);
+    if (verdict == IPMSM_ANGLE_USABLE || verdict == IPMSM_ANGLE_DOUBTFUL) {
         const struct ipmsm_estimate *estimate = &drive->receiver.estimate;
         insist(theta_e >= 0.0f && theta_e < IPMSM_TWO_PI);
-        insist(estimate->valid && estimate->locked && estimate->polarity_known);
+        insist(estimate->locked && estimate->polarity_known);
+        insist(estimate->valid == (verdict == IPMSM_ANGLE_USABLE));
+        insist(estimate->sigma_known && estimate->sigma_theta <= drive->receiver.sigma_limit);
         insist(drive->sender.next - 1u - estimate->sample <= 100u);
     }
 }

@@ -122,7 +122,7 @@ enum ipmsm_angle_verdict ipmsm_drive_angle(const struct ipmsm_drive *drive, floa
     const uint32_t before = lock(drive);
     const uint32_t sample = latest_sample(drive);
     const enum ipmsm_angle_verdict verdict = ipmsm_receiver_verdict(&drive->receiver, sample, now_us(drive));
-    if (verdict == IPMSM_ANGLE_USABLE) {
+    if (verdict == IPMSM_ANGLE_USABLE || verdict == IPMSM_ANGLE_DOUBTFUL) {
         *theta_e = ipmsm_receiver_theta(&drive->receiver, sample, ahead);
     }
     unlock(drive, before);

@@ -127,13 +127,14 @@ enum ipmsm_angle_verdict ipmsm_receiver_verdict(const struct ipmsm_receiver *rec
     if (!is_fresh(receiver, sample, now_us)) {
         return IPMSM_ANGLE_MISSING;
     }
-    if (!(estimate->valid && estimate->locked && estimate->polarity_known)) {
+    const bool certain = estimate->sigma_known && estimate->sigma_theta <= receiver->sigma_limit;
+    if (!(estimate->locked && estimate->polarity_known && (estimate->valid || certain))) {
         return IPMSM_ANGLE_INVALID;
     }
-    if (!(estimate->sigma_known && estimate->sigma_theta <= receiver->sigma_limit)) {
+    if (!certain) {
         return IPMSM_ANGLE_UNCERTAIN;
     }
-    return IPMSM_ANGLE_USABLE;
+    return estimate->valid ? IPMSM_ANGLE_USABLE : IPMSM_ANGLE_DOUBTFUL;
 }
 
 float ipmsm_receiver_theta(const struct ipmsm_receiver *receiver, uint32_t sample, float ahead)

@@ -211,6 +211,18 @@ static void the_angle_comes_and_goes(void)
     CHECK(ipmsm_drive_angle_usable(&drive)); /* 100 samples after the one it belongs to */
     (void)period();
     CHECK(!ipmsm_drive_angle_usable(&drive));
+    v.sample = 1196;
+    v.valid = false;
+    hear(estimate_frame(6, 1, v));
+    ipmsm_drive_receive(&drive);
+    CHECK(ipmsm_drive_angle(&drive, 0.0f, &theta) == IPMSM_ANGLE_DOUBTFUL);
+    CHECK_NEAR(theta, 1.0f, 3e-4f);
+    CHECK(!ipmsm_drive_angle_usable(&drive)); /* to begin with */
+    theta = -1.0f;
+    v.locked = false;
+    hear(estimate_frame(6, 2, v));
+    ipmsm_drive_receive(&drive);
+    CHECK(ipmsm_drive_angle(&drive, 0.0f, &theta) == IPMSM_ANGLE_INVALID && theta == -1.0f);
     CHECK(port.lock_faults == 0u && port.lock_depth == 0);
 }
 

@@ -115,8 +115,22 @@ static void says_whether_the_angle_may_be_used(void)
     CHECK(verdict_on(v) == IPMSM_ANGLE_USABLE);
     v.sigma_theta = 5.5f;
     CHECK(verdict_on(v) == IPMSM_ANGLE_UNCERTAIN);
+    /* Not valid but within the limit: good enough to go on with, if everything else is. */
     v = good;
     v.valid = false;
+    CHECK(verdict_on(v) == IPMSM_ANGLE_DOUBTFUL);
+    v.sigma_theta = 5.0f;
+    CHECK(verdict_on(v) == IPMSM_ANGLE_DOUBTFUL);
+    v.sigma_theta = 5.5f;
+    CHECK(verdict_on(v) == IPMSM_ANGLE_INVALID);
+    v.sigma_theta = 127.5f;
+    CHECK(verdict_on(v) == IPMSM_ANGLE_INVALID);
+    v = good;
+    v.valid = false;
+    v.locked = false;
+    CHECK(verdict_on(v) == IPMSM_ANGLE_INVALID);
+    v.locked = true;
+    v.polarity_known = false;
     CHECK(verdict_on(v) == IPMSM_ANGLE_INVALID);
     v = good;
     v.locked = false;

@@ -10,8 +10,8 @@
 
 Whether an estimate may be used is decided by the rules of the C library for the drive's microcontroller
 (firmware_stub/src/receiver.c): in sequence and intact, younger than its time to live by the drive's own sample
-counter, valid, locked, polarity known, 1-sigma within the limit.  An estimate says so itself; its age is asked anew
-at every sample.
+counter, locked, polarity known, 1-sigma within the limit, and valid to begin with; a control that runs on it
+already goes on without the last.  An estimate says so itself; its age is asked anew at every sample.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ class AngleVerdict(IntEnum):
     MISSING = 1
     INVALID = 2
     UNCERTAIN = 3
+    DOUBTFUL = 4
+    """Not valid, but all the rest: good enough to go on with, not to begin."""
 
 
 class AngleState(IntEnum):
@@ -60,7 +62,8 @@ class AngleState(IntEnum):
 
 ENCODER, COMPANION, HOLD, OPEN_LOOP, STOPPED = (int(state) for state in AngleState)
 _MISSING = int(AngleVerdict.MISSING)
-USABLE = int(AngleVerdict.USABLE)
+_USABLE = int(AngleVerdict.USABLE)
+_DOUBTFUL = int(AngleVerdict.DOUBTFUL)
 _ENCODER_ONLY, _COMPANION_ONLY, _BOTH = range(len(ANGLE_SOURCES))
 
 # Settings, float64 (G_SIZE,)
@@ -130,18 +133,19 @@ def tell(out: Array, first: int, a: Array, g: Array, period: float) -> None:
 
 
 @kernel
-def choose(a: Array, g: Array, sample: float, usable: bool, wanted: float, may_turn: bool) -> int:
+def choose(a: Array, g: Array, sample: float, judged: int, wanted: float, may_turn: bool) -> int:
     """The AngleState of this sample, from the last one; a is moved on.
 
-    usable: whether the companion's angle is.  wanted: speed reference, whose sign alone counts.  may_turn: the
-    shaft is free, so it can be turned open loop.
+    judged: the AngleVerdict on the companion's angle.  wanted: speed reference, whose sign alone counts.
+    may_turn: the shaft is free, so it can be turned open loop.
     """
     state = int(a[A_STATE])
+    usable = judged == _USABLE
     if state == ENCODER:
         if sample >= g[G_ENCODER_FAILS]:
             state = COMPANION if g[G_SOURCE] == _BOTH and usable else STOPPED
     elif state == COMPANION:
-        if not usable:
+        if not usable and judged != _DOUBTFUL:
             state = STOPPED
     elif state != STOPPED:
         if usable:

@@ -73,10 +73,16 @@ class EstimateReceiver:
             if sample <= SAMPLE_MASK or age > self._max_age:
                 self.late += 1
                 continue
-            verdict = AngleVerdict.USABLE
-            if not (valid and locked and polarity_known):
-                verdict = AngleVerdict.INVALID
-            elif sigma > self._sigma_limit:  # "unknown" is the largest value there is
-                verdict = AngleVerdict.UNCERTAIN
-            taken = Estimate(theta, omega, sample - age, verdict)
+            certain = sigma <= self._sigma_limit  # "unknown" is the largest value there is
+            taken = Estimate(theta, omega, sample - age,
+                             _verdict(bool(valid), bool(locked and polarity_known), certain))
         return taken
+
+
+def _verdict(valid: bool, holds: bool, certain: bool) -> AngleVerdict:
+    """holds: locked, and of known polarity; certain: 1-sigma within the limit."""
+    if not (holds and (valid or certain)):
+        return AngleVerdict.INVALID
+    if not certain:
+        return AngleVerdict.UNCERTAIN
+    return AngleVerdict.USABLE if valid else AngleVerdict.DOUBTFUL

@@ -22,7 +22,7 @@ from ipmsm_can.frames import FRAME_BYTES, FrameBlock
 from ipmsm_can.wire.dbc import default_dbc_path
 from ipmsm_can.wire.protocol import Protocol, Waveform
 
-ANGLE_USABLE, ANGLE_MISSING, ANGLE_INVALID, ANGLE_UNCERTAIN = range(4)
+ANGLE_USABLE, ANGLE_MISSING, ANGLE_INVALID, ANGLE_UNCERTAIN, ANGLE_DOUBTFUL = range(5)
 """What the library says of the companion's angle: enum ipmsm_angle_verdict."""
 
 

@@ -42,7 +42,6 @@ from ipmsm_can.drive.angle_source import (
     T_SIZE,
     T_THETA,
     T_VERDICT,
-    USABLE,
     choose,
     coast,
     tell,
@@ -247,7 +246,7 @@ def _simulate(
         out[15, j] = probe[3, j]
         load_mean = 0.5 * (load + value_at(load_track, k + 1.0, True))
         omega_end = 0.0 if locked else value_at(speed_track, k + 1.0, True)
-        state = choose(a, g, k, told[T_VERDICT, j] == USABLE, reference, free_shaft)
+        state = choose(a, g, k, int(told[T_VERDICT, j]), reference, free_shaft)
         held = braked and state == HOLD
         out[16, j] = state
         out[17, j] = math.nan

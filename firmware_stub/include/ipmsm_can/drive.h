@@ -60,10 +60,11 @@ void ipmsm_drive_stop_probing(struct ipmsm_drive *drive);
 
 /* Whether the rotor angle may be used, and the angle `ahead` control periods after the latest sample
  * [rad electrical, 0..2 pi] (1.5 for the middle of the interval a voltage computed now is applied in).
- * theta_e is written only if it may. */
+ * theta_e is written only where the verdict is IPMSM_ANGLE_USABLE, which is what it takes to begin, or
+ * IPMSM_ANGLE_DOUBTFUL, with which a control that runs on the angle already may go on. */
 enum ipmsm_angle_verdict ipmsm_drive_angle(const struct ipmsm_drive *drive, float ahead, float *theta_e);
 
-/* The same question without the angle. */
+/* Whether a control may begin with the angle: the verdict is IPMSM_ANGLE_USABLE. */
 bool ipmsm_drive_angle_usable(const struct ipmsm_drive *drive);
 
 /* Speed of the last estimate [rad/s electrical], 0 before the first; to be used only where the angle may. */

@@ -23,9 +23,12 @@ enum ipmsm_received {
 
 enum ipmsm_angle_verdict {
     IPMSM_ANGLE_USABLE = 0,
-    IPMSM_ANGLE_MISSING = 1,  /* no estimate yet, or the last one has grown too old */
-    IPMSM_ANGLE_INVALID = 2,  /* the companion says valid, locked or polarity_known is not so */
-    IPMSM_ANGLE_UNCERTAIN = 3 /* its one-sigma is unknown or beyond the limit */
+    IPMSM_ANGLE_MISSING = 1,   /* no estimate yet, or the last one has grown too old */
+    IPMSM_ANGLE_INVALID = 2,   /* the companion says valid, locked or polarity_known is not so */
+    IPMSM_ANGLE_UNCERTAIN = 3, /* its one-sigma is unknown or beyond the limit */
+    /* Not valid, but locked, of known polarity and its one-sigma within the limit.  A control that runs on the
+     * companion's angle may go on with it; none may begin with it. */
+    IPMSM_ANGLE_DOUBTFUL = 4
 };
 
 /* Frames of one message. */
@@ -77,7 +80,7 @@ enum ipmsm_angle_verdict ipmsm_receiver_verdict(const struct ipmsm_receiver *rec
                                                 uint32_t now_us);
 
 /* The rotor angle `ahead` periods after t_k of sample `sample`: 0..2 pi [rad electrical].  Meaningful only
- * where the verdict is IPMSM_ANGLE_USABLE. */
+ * where the verdict is IPMSM_ANGLE_USABLE or IPMSM_ANGLE_DOUBTFUL. */
 float ipmsm_receiver_theta(const struct ipmsm_receiver *receiver, uint32_t sample, float ahead);
 
 #endif
