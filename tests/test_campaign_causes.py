@@ -304,25 +304,19 @@ def test_offsets_of_the_current_sensors_are_learned_and_so_is_their_dead_time(th
     assert (error < 1.5 * np.degrees(out.sigma)).all()
 
 
-@given(st_.integers(0, 2**32 - 1), st_.floats(1.0, 1.5), st_.floats(0.5, 2.0))
-def test_doubt_makes_nothing_surer_and_no_voltage_error_larger_than_its_prior(seed: int, factor: float,
-                                                                             wide: float) -> None:
-    """What is left is a covariance, nowhere below the one before but where that was beyond the priors."""
+@given(st_.integers(0, 2**32 - 1), st_.floats(0.5, 2.0), st_.floats(0.1, 4.0))
+def test_doubt_makes_nothing_surer(seed: int, wide: float, test: float) -> None:
+    """The voltage's errors go back to their priors, the flux's grow by what the innovations are too large."""
     root = np.random.default_rng(seed).standard_normal((9, 9))
     before = root @ root.T / 9.0
     parameters = np.zeros(1, [("prior", "f8", (7,))])
     parameters["prior"] = wide * np.diag(before)[2:]
     P = before.copy()
-    forgetting.fade(P, factor, parameters[0])
-    assert np.allclose(P, P.T)
-    assert np.linalg.eigvalsh(P).min() > -1e-12
-    assert np.allclose(np.diag(P)[:2], factor * np.diag(before)[:2])
-    assert np.allclose(np.diag(P)[2:], min(factor, wide) * np.diag(before)[2:])
-    P = before.copy()
-    forgetting.distrust(P, parameters[0])
-    assert np.linalg.eigvalsh(P - before).min() > -1e-12
+    forgetting.distrust(P, test, parameters[0])
+    assert np.array_equal(P, P.T)
+    assert np.allclose(P[:2, :2], max(test, 1.0) * before[:2, :2])
     assert np.allclose(np.diag(P)[2:], max(1.0, wide) * np.diag(before)[2:])
-    assert np.array_equal(P[:2, :], before[:2, :])
+    assert np.linalg.eigvalsh(P).min() > -1e-12
 
 
 def test_windows_that_are_wrong_alike_make_the_angle_no_surer_than_one_of_them() -> None:
@@ -343,7 +337,7 @@ def test_windows_that_are_wrong_alike_make_the_angle_no_surer_than_one_of_them()
     assert 0.02 < math.atan2(state["x_b"], state["x_a"]) < 0.1
 
 
-@pytest.mark.parametrize("number", [436, 2130, 2861, 5187, 7318])
+@pytest.mark.parametrize("number", [436, 2130, 2435, 2861, 5187, 6088, 7318])
 def test_runs_of_the_campaign_that_were_wrong_once(number: int) -> None:
     course = trial.simulate(scenario.draw(1, number))
     error = np.abs(course.error[course.valid])

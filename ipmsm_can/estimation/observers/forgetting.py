@@ -1,7 +1,6 @@
 """What `riccati` gives up: after a loss of lock all it has learned, after an absurd sample the flux as well.
 
-Short of that it doubts: a little of everything while the samples do not fit (`fade`), and what it took the
-voltage's errors for once it turns out where north is (`distrust`).
+Short of that it doubts what it took the voltage's errors for, once it turns out where north is (`distrust`).
 """
 
 from __future__ import annotations
@@ -38,22 +37,17 @@ def forget(P: Floats, st: Any, p: Any, ceiling: float) -> None:
 
 
 @kernel
-def fade(P: Floats, factor: float, p: Any) -> None:
-    """What is known counts less by the factor >= 1, an error of the voltage no less than its prior."""
-    for a in range(FLUX_STATES):
+def distrust(P: Floats, test: float, p: Any) -> None:
+    """The voltage's errors may be anything that their priors allow, whatever they are taken for.
+
+    test: mean square of the innovations over their variance.  If they are larger than they should be, so is the
+    flux's error.
+    """
+    wider = math.sqrt(max(test, 1.0))
+    for a in range(2):
         for b in range(FLUX_STATES):
-            P[a, b] *= factor
-    for j in range(2, FLUX_STATES):
-        if P[j, j] > p.prior[j - 2]:
-            shrink = math.sqrt(p.prior[j - 2] / P[j, j])
-            for a in range(FLUX_STATES):
-                P[j, a] *= shrink
-                P[a, j] *= shrink
-
-
-@kernel
-def distrust(P: Floats, p: Any) -> None:
-    """The voltage's errors may be anything that their priors allow, whatever they are taken for."""
+            P[a, b] *= wider
+            P[b, a] *= wider
     for j in range(BIASES):
         P[2 + j, 2 + j] = max(P[2 + j, 2 + j], p.prior[j])
 

@@ -34,8 +34,7 @@ The angle's 1-sigma is the covariance across x_hat, the current noise L_q s_i, a
 take from L_q, each over |x_hat|.
 
 Loss of lock.  The squared innovation over its variance and that of the length of x_hat against psi_m + L_0 i_d,
-whichever is larger, averaged over INNOVATION_TIME.  Beyond _FITS_BELOW P is too small for what is seen, and grows,
-of the voltage errors up to their priors; beyond _LOST_ABOVE everything is forgotten but the flux itself.
+whichever is larger, averaged over INNOVATION_TIME; beyond _LOST_ABOVE everything is forgotten but the flux itself.
 
 Polarity.  Standstill makes |Phi| = |L_0 H[i]| and the voltage error twice its size; only while Phi is longer than
 both together does a sample count for the polarity.  It is known once these samples alone, against all of the
@@ -64,7 +63,7 @@ from ipmsm_can.estimation.observers.covariance import (
     limit,
     voltage_variance,
 )
-from ipmsm_can.estimation.observers.forgetting import distrust, fade, forget, start_over
+from ipmsm_can.estimation.observers.forgetting import distrust, forget, start_over
 from ipmsm_can.estimation.observers.lost_steps import left_out, straight_on
 from ipmsm_can.estimation.observers.voltage_errors import (
     BIASES,
@@ -366,8 +365,6 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
         if not sigma < math.pi:
             sigma = math.pi
         st.test += smoothing * (min(misfit, 1e4) - st.test)
-        if st.test > _FITS_BELOW:
-            fade(P, 1.0 + smoothing * (st.test / _FITS_BELOW - 1.0), p)
         if st.test > _LOST_ABOVE:
             st.lost += 1
             forget(P, st, p, ceiling)
@@ -386,7 +383,7 @@ def riccati_block(samples: Floats, regression: Floats, parameters: NDArray[np.vo
                 st.clear[2] = ceiling
         elif fits and open2 < _POLARITY_SHARE * _POLARITY_SHARE * psi_m * psi_m:
             if st.polarity == 0:
-                distrust(P, p)
+                distrust(P, st.test, p)
             st.polarity = 1
         out[0, k] = l_a
         out[1, k] = l_b
