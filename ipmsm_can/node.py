@@ -260,7 +260,7 @@ class Node:
         else:
             estimate = self.startup.process(run.values, run.gap, run.filled)
         if withheld.any():
-            estimate.flags[withheld] &= 0xFF ^ confidence.VALID
+            confidence.withhold(estimate.flags, withheld)
         clipped = run.doubt & np.uint8(CLIPPED)
         if self.distrusting or clipped.any():
             clipping.hold_block(clipped, estimate.regression, estimate.flux, estimate.angle, self._settings.alpha,

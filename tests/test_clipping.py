@@ -26,7 +26,8 @@ from ipmsm_can.wire.sequence_kernel import CLIPPED
 
 PROTOCOL = Protocol()
 RATE = 5000.0
-WITHOUT = 0xFF ^ confidence.VALID
+ALL = confidence.LOCKED | confidence.POLARITY_KNOWN | confidence.VALID
+WITHOUT = ALL ^ confidence.VALID | confidence.WITHHELD
 
 
 def database(axes: str, ends: str, kind: str = "1-") -> Protocol:
@@ -172,7 +173,7 @@ def test_the_hold_by_hand(gain: int) -> None:
     alpha, T_s = 50.0, 0.01
     regression, flux, angle = rng.normal(size=(7, n)), np.full((6, n), gain * 1e-3), rng.normal(100, 1, (3, n))
     clipped = cut_off.astype(np.uint8)
-    expected = np.full(n, 0xFF, np.uint8)
+    expected = np.full(n, ALL, np.uint8)
     for k in range(n):
         past = np.flatnonzero(clipped[:k + 1])
         if past.size:
@@ -183,7 +184,7 @@ def test_the_hold_by_hand(gain: int) -> None:
             margin = min(alpha * T_s * len(since) - 5.0, contracted - 3.0)
             if margin < -1e-9:
                 expected[k] = WITHOUT
-    found = np.full(n, 0xFF, np.uint8)
+    found = np.full(n, ALL, np.uint8)
     state = clipping.new_state()
     for a, b in pairwise([0, *sorted(set(cuts)), n]):
         clipping.hold_block(clipped[a:b], np.ascontiguousarray(regression[:, a:b]),
@@ -191,7 +192,7 @@ def test_the_hold_by_hand(gain: int) -> None:
                             GES, state, found[a:b])
     # once over, it is over until the next one
     for k in range(1, n):
-        if not clipped[k] and expected[k - 1] == 0xFF:
-            expected[k] = 0xFF
+        if not clipped[k] and expected[k - 1] == ALL:
+            expected[k] = ALL
     assert np.array_equal(found, expected)
-    assert (found == WITHOUT).any() and (gain < 50 or (found[np.argmax(cut_off):] == 0xFF).any())
+    assert (found == WITHOUT).any() and (gain < 50 or (found[np.argmax(cut_off):] == ALL).any())

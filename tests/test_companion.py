@@ -116,7 +116,7 @@ def test_estimates_say_what_was_estimated(second: tuple[list[Tracked], FrameBloc
         assert abs(e["omega_e"] - omega[k]) < 0.126
         assert abs(e["sigma_theta"] - min(math.degrees(sigma[k]), 127.5)) < 0.251
         assert (e["locked"], e["polarity_known"], e["valid"], e["injecting"]) == (
-            flags[k] & 1, flags[k] >> 1 & 1, flags[k] >> 2, 0)
+            flags[k] & 1, flags[k] >> 1 & 1, flags[k] >> 2 & 1, 0)
         seen.add(int(flags[k]))
     assert {0, confidence.LOCKED, 7} <= seen
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import cantools
 import numpy as np
 import pytest
 
@@ -14,6 +17,7 @@ from ipmsm_can.estimation import confidence
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.motor import M2
 from ipmsm_can.node import Tracked
+from ipmsm_can.wire.dbc import default_dbc_path
 from ipmsm_can.wire.protocol import MessageKind, Protocol
 
 PROTOCOL = Protocol()
@@ -81,6 +85,33 @@ def test_a_drive_without_timing_is_not_believed_either_until_the_pace_settles_it
     assert counter[-1] == theta.size - 1
     assert flags[-1] & confidence.VALID
     assert not doubt[-1]
+
+
+def test_a_drive_cannot_go_on_with_an_angle_that_nobody_can_date() -> None:
+    """It may with one that is not valid while sigma is within its limit; so sigma is unknown on the wire."""
+    frames, _ = traffic(1000.0, 1.7)
+    is_sample = frames.can_id == PROTOCOL.base_ids[MessageKind.DRIVE_SAMPLE]
+    number = np.cumsum(is_sample) - 1
+    frames = frames.take(np.flatnonzero(~(is_sample & (number >= 7003) & (number < 7035))))
+    companion = Companion([config_from({"motor": {"preset": "m2"}})], PROTOCOL, transmit=True)
+    database: Any = cantools.database.load_file(default_dbc_path())
+    message = database.get_message_by_name("PositionEstimate")
+    doubtful = sure = 0
+    for begin in range(0, len(frames), 5):
+        tracked = companion.feed(frames.take(slice(begin, begin + 5)))
+        answers = companion.respond(tracked, int(frames.t_ns[min(begin + 4, len(frames) - 1)]))
+        doubts = {int(c) & 0x3FF: (bool(d), float(np.degrees(s))) for t in tracked
+                  for c, d, s in zip(t.run.counter, t.run.doubt, t.estimate.sigma, strict=True)}
+        for row in np.flatnonzero(answers.can_id == message.frame_id):
+            said = message.decode(answers.data[row, :8].tobytes(), decode_choices=False)
+            doubted, sigma = doubts[said["sample_counter"]]
+            if doubted:
+                assert not said["valid"] and said["sigma_theta"] == 127.5
+                doubtful += sigma < 5.0  # else nothing was at stake
+            elif said["valid"]:
+                assert abs(said["sigma_theta"] - sigma) < 0.26
+                sure += 1
+    assert doubtful > 5 and sure > 1000
 
 
 def test_a_late_burst_is_believed_again_as_soon_as_it_has_caught_up() -> None:

@@ -295,6 +295,25 @@ def test_speed_that_cannot_be_is_not_locked() -> None:
     assert not (flags[500 + int(0.02 * RATE):] & VALID).any()
 
 
+def test_a_lock_that_was_lost_is_no_lock_to_go_on_with() -> None:
+    """One sample that does not fit, between two frames of a drive: until the probation is over sigma is no help."""
+    state = confidence.new_state(M2, 100.0, 0.059, 0.5, 0.02, 0.17, RATE, kinds.RICCATI)
+    n = 2000
+    phi = 2.0 * 100.0 * M2.psi_m * 94.0 / math.hypot(94.0, 100.0)
+    rows, flux, angle = np.zeros((7, n)), np.zeros((common.ROWS, n)), np.zeros((3, n))
+    rows[1] = phi
+    flux[2], flux[5], flux[6] = M2.psi_m, 0.01, common.FITS | common.POLARITY
+    flux[6, 1000] = common.POLARITY
+    angle[2] = 94.0
+    sigma, flags = np.empty(n), np.empty(n, np.uint8)
+    confidence.confidence_block(rows, flux, angle, state, sigma, flags)
+    assert flags[999] == LOCKED | POLARITY | VALID
+    assert not flags[1000] & LOCKED
+    probation = slice(1000, 1000 + int(0.1 * RATE) - 1)
+    assert (flags[probation] & confidence.WITHHELD).all() and not (flags[probation] & VALID).any()
+    assert flags[-1] == LOCKED | POLARITY | VALID
+
+
 def test_a_burst_in_a_speed_ramp_is_carried_over() -> None:
     speed = ((0.0, 100.0), (0.3, 100.0), (0.55, 1000.0), (1.0, 1000.0))
     track = Profile(tuple((t, v * RPM) for t, v in speed), ((0.0, 1.0),), 1.0, "ramp")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ipmsm_can._jit import kernel
 from ipmsm_can.bus.message_table import unpack
 from ipmsm_can.estimation import regression, speed
-from ipmsm_can.estimation.confidence import VALID
+from ipmsm_can.estimation.confidence import VALID, WITHHELD
 from ipmsm_can.estimation.estimator import estimate_block
 from ipmsm_can.estimation.observers import common
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_SFF_MASK
@@ -369,7 +369,7 @@ def lap(plan: Plan, wire: Wire, incoming: Incoming, outgoing: Outgoing, records:
         kept.hf_current[0] = meter_block(samples, records.meter)
         for k in range(m):
             if run_doubt[k]:
-                run_flags[k] &= 0xFF ^ VALID
+                run_flags[k] = run_flags[k] & (0xFF ^ VALID) | WITHHELD
             kept.counter[0, done + k] = run_counter[k]
             kept.counter[1, done + k] = run_t[k]
             kept.marks[0, done + k] = run_filled[k]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.confidence import POLARITY_CONTRACTION, VALID
+from ipmsm_can.estimation.confidence import POLARITY_CONTRACTION, VALID, WITHHELD
 from ipmsm_can.estimation.observers.kinds import RICCATI
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ def new_state() -> NDArray[np.void]:
 @kernel
 def hold_block(clipped: NDArray[np.uint8], regression: Floats, flux: Floats, angle: Floats, alpha: float,
                T_s: float, kind: int, state: NDArray[np.void], flags: NDArray[np.uint8]) -> None:
-    """Take VALID out of flags (N,) at each sample that was cut off, and while what it spoiled lasts.
+    """Put WITHHELD for VALID into flags (N,) at each sample that was cut off, and while what it spoiled lasts.
 
     clipped: uint8 (N,), not 0 where the sample was cut off.  regression (7, N), flux (6, N), angle (3, N): as in
     EstimateBlock.  alpha [1/s]; T_s [s]; kind: of the observer.  Any partition into blocks gives the same bits.
@@ -72,4 +72,4 @@ def hold_block(clipped: NDArray[np.uint8], regression: Floats, flux: Floats, ang
             if st.faded >= FILTERS_FORGET and forgotten:
                 st.holding = 0
         if st.holding:
-            flags[k] &= 0xFF ^ VALID
+            flags[k] = flags[k] & (0xFF ^ VALID) | WITHHELD

@@ -92,6 +92,8 @@ _CALMING = 0.1
 LOCKED = 1
 POLARITY_KNOWN = 2
 VALID = 4
+WITHHELD = 8
+"""Not valid for a reason that sigma knows nothing of: on the wire it is unknown then, or a drive might go on."""
 
 STATE = np.dtype([
     ("started", "i8"), ("T_s", "f8"), ("alpha", "f8"), ("psi_m", "f8"), ("ell", "f8"), ("epsilon", "f8"),
@@ -148,6 +150,11 @@ def forget(state: NDArray[np.void]) -> None:
     """Give up lock, polarity and covariance: the next sample starts from nothing."""
     for name in ("started", "test", "contraction", "locked", "polarity", "valid", "sure"):
         state[name] = 0
+
+
+def withhold(flags: NDArray[np.uint8], where: NDArray[np.bool_]) -> None:
+    """Put WITHHELD for VALID into flags (N,) where (N,) the samples themselves are in doubt."""
+    flags[where] = flags[where] & np.uint8(0xFF ^ VALID) | np.uint8(WITHHELD)
 
 
 def widen(state: NDArray[np.void], flux_variance: float) -> None:
@@ -281,6 +288,8 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             sure = max(sure - st.T_s, 0.0)
             valid = 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
+        if probation > 0.0:
+            flags[k] |= WITHHELD
     st.test = test
     st.locked = locked
     st.lost = lost
@@ -298,7 +307,7 @@ def confidence_block(regression: Floats, flux: Floats, speed: Floats, state: NDA
 
     regression: float64 (7, N); flux: float64 (7, N) from an observer; speed: float64 (3, N).
     sigma: float64 (N,), 1-sigma of theta_hat [rad electrical], at most pi, which means unknown.
-    flags: uint8 (N,), bits LOCKED, POLARITY_KNOWN, VALID.
+    flags: uint8 (N,), bits LOCKED, POLARITY_KNOWN, VALID, WITHHELD.
     """
     st = state[0]
     if st.axis_only:

@@ -83,7 +83,7 @@ class EstimateBlock:
     angle (3, N): theta_hat, smoothed theta [rad electrical, -pi..pi], omega [rad/s electrical].
     excitation (N,): smallest eigenvalue of the windowed integral of Phi Phi^T [V^2 s].
     sigma (N,): 1-sigma of theta_hat [rad electrical], pi = unknown.
-    flags (N,): bits LOCKED, POLARITY_KNOWN, VALID of `confidence`.
+    flags (N,): bits LOCKED, POLARITY_KNOWN, VALID, WITHHELD of `confidence`.
     """
 
     regression: Floats

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ipmsm_can._jit import kernel
-from ipmsm_can.estimation.confidence import LOCKED, POLARITY_KNOWN, VALID
+from ipmsm_can.estimation.confidence import LOCKED, POLARITY_KNOWN, VALID, WITHHELD
 from ipmsm_can.wire.protocol import CompanionState
 
 POSITION_SIGNALS = ("theta_e", "omega_e", "sigma_theta", "sample_counter", "valid", "locked", "polarity_known",
@@ -49,7 +49,8 @@ def position_values(counter: NDArray[np.int64], angle: NDArray[np.float64], sigm
                     rows: NDArray[np.intp], out: NDArray[np.float64]) -> None:
     """Physical values of PositionEstimate for the rows `due`, into out (n_signals, len(due)).
 
-    angle (3, N): theta_hat, smoothed theta, omega [rad, rad/s electrical].  sigma (N,) [rad].  step: resolution
+    angle (3, N): theta_hat, smoothed theta, omega [rad, rad/s electrical].  sigma (N,) [rad]; on the wire it is
+    unknown where flags (N,) say WITHHELD.  step: resolution
     of theta_e on the wire [rad]; what would round up to a whole turn becomes 0.  rows: where in `out` each of
     POSITION_SIGNALS belongs.
     """
@@ -58,7 +59,7 @@ def position_values(counter: NDArray[np.int64], angle: NDArray[np.float64], sigm
         theta = angle[0, k] - _TWO_PI * math.floor(angle[0, k] / _TWO_PI)
         out[rows[0], m] = theta if theta < _TWO_PI - 0.5 * step else 0.0
         out[rows[1], m] = angle[2, k]
-        out[rows[2], m] = math.degrees(sigma[k])
+        out[rows[2], m] = 180.0 if flags[k] & WITHHELD else math.degrees(sigma[k])
         out[rows[3], m] = counter[k] & 0x3FF
         out[rows[4], m] = 1.0 if flags[k] & VALID else 0.0
         out[rows[5], m] = 1.0 if flags[k] & LOCKED else 0.0
