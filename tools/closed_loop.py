@@ -44,7 +44,7 @@ SOURCES: dict[str, dict[str, Any]] = {
 }
 """Settings of the observer; the natural frequency of its speed loop is to be well above the drive's 15 Hz."""
 LINEAR = {"saturation_uncertainty": 0.0}
-"""What a companion is told of a machine that does not saturate; of one that does it knows no more than by default."""
+"""What a companion is told of a machine that does not saturate; of one that does it knows no more than usual."""
 BUS = {
     "ideal": BusFaults(),
     "0.5 ms": BusFaults(loss=0.01, delay_ns=500_000, seed=1),

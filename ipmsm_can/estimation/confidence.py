@@ -86,6 +86,10 @@ _FAST_EMF = 7.0
 """Back-EMF over the voltage's uncertainty from which on the rotor counts as fast."""
 _SURE = 0.005
 """Time [s] for which an angle has to be sure before it is valid: the first samples that it fits are no proof."""
+_SURE_AGAIN, _LONGEST_SURE = 2.0, 0.2
+"""Angle [rad electrical] that the rotor has to turn, or longest time [s], for which an angle has to be sure before
+it is valid again, once it was too unsure for _SURE: what the filter took the voltage for while it went astray makes
+a wrong angle fit, until the rotor stands differently."""
 _CALMING = 0.1
 """Time constant [s] of the speed that counts for becoming valid: an angle put right looks like a turning rotor."""
 
@@ -104,8 +108,9 @@ STATE = np.dtype([
     ("own", "i8"), ("L_0", "f8"), ("volts", "f8"),
     ("axis_only", "i8"), ("delay", "f8"), ("radial", "i8"), ("slips", "i8"), ("rate", "f8"), ("L", "f8"),
     ("across", "f8"), ("neglected", "f8"), ("spread", "f8"),
-    # riccati: losses of lock that are not yet forgotten, for how long [s] nothing is valid, and what was said last.
-    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"), ("calm", "f8"), ("sure", "f8"),
+    # riccati: losses of lock that are not yet forgotten, for how long [s] nothing is valid, and what was said last;
+    # again: 1 it was valid, 2 and has been too unsure for _SURE since.
+    ("losses", "f8"), ("probation", "f8"), ("valid", "i8"), ("calm", "f8"), ("sure", "f8"), ("again", "i8"),
 ])
 
 
@@ -148,7 +153,7 @@ def new_state(motor: Motor, alpha: float, epsilon: float, voltage_uncertainty: f
 
 def forget(state: NDArray[np.void]) -> None:
     """Give up lock, polarity and covariance: the next sample starts from nothing."""
-    for name in ("started", "test", "contraction", "locked", "polarity", "valid", "sure"):
+    for name in ("started", "test", "contraction", "locked", "polarity", "valid", "sure", "again"):
         state[name] = 0
 
 
@@ -242,6 +247,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     valid = st.valid
     calm = st.calm
     sure = st.sure
+    again = st.again
     steadying = 1.0 - math.exp(-st.T_s / _CALMING)
     for k in range(flux.shape[1]):
         s = flux[5, k]
@@ -281,11 +287,20 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
             sure = 0.0
             valid = 0
         elif s <= share * st.sigma_limit:
-            sure = min(sure + st.T_s, _SURE + st.T_s)
-            valid = 1 if valid or sure > _SURE else 0
+            needed = _SURE
+            if again == 2:
+                needed = min(max(_SURE_AGAIN / max(abs(calm), 1e-9), _SURE), _LONGEST_SURE)
+            sure = min(sure + st.T_s, needed + st.T_s)
+            if sure > needed:
+                valid = 1
+                again = 0
         else:
             # Too unsure for a moment, it has to be sure again for as long, no longer.
             sure = max(sure - st.T_s, 0.0)
+            if valid:
+                again = 1
+            if again == 1 and sure == 0.0:
+                again = 2
             valid = 0
         flags[k] = LOCKED * locked + POLARITY_KNOWN * polarity + (VALID if valid else 0)
         if probation > 0.0:
@@ -298,6 +313,7 @@ def _own_block(regression: Floats, flux: Floats, speed: Floats, state: NDArray[n
     st.valid = valid
     st.calm = calm
     st.sure = sure
+    st.again = again
 
 
 @kernel

@@ -272,12 +272,14 @@ class Estimator:
             bent = 0.0
             one_step_back, lag = angle - float(pll["omega"][0]) / self.sample_rate, 0.0
             own = KINDS[s.kind] == RICCATI
+            unseen = _TORQUE_DOUBT * self.motor.pole_pairs * self.motor.rated_torque / self.motor.J
+            if own:
+                bent = 0.5 * unseen * elapsed**2
             if own and self._confidence["locked"][0]:
                 speed_before = float(pll["omega"][0])
                 angle, omega, lag = speed.carried(pll, elapsed)
                 accelerated = (omega - speed.carried(pll, 0.0)[1]) / elapsed
-                unseen = _TORQUE_DOUBT * self.motor.pole_pairs * self.motor.rated_torque / self.motor.J
-                bent = 0.5 * math.hypot(accelerated, unseen) * elapsed**2
+                bent = math.hypot(bent, 0.5 * accelerated * elapsed**2)
                 turned = angle - float(pll["theta_hat"][0])
                 one_step_back = angle - omega / self.sample_rate
                 # The loop goes on with the lag that it had.
@@ -292,8 +294,11 @@ class Estimator:
             pll["theta_hat"] = math.remainder(one_step_back, 2.0 * math.pi)
             pll["theta"] = math.remainder(one_step_back - lag, 2.0 * math.pi)
             if missing < 0:
-                # What was taken for one stretch of time was two, or the other way round.
-                doubt = size * min(abs(missing * float(pll["omega"][0])) / self.sample_rate, math.pi)
+                # What was taken for one stretch of time was two, or the other way round.  How fast the rotor turned
+                # in between the speed loop has forgotten by now where the seam did not fit.
+                seam = abs(missing) / self.sample_rate
+                off = math.hypot(seam * float(pll["omega"][0]), 0.5 * unseen * seam**2)
+                doubt = size * (min(off, math.pi) if self._confidence["locked"][0] else math.pi)
             else:
                 doubt = size * min(math.hypot(_SPEED_DOUBT * turned, bent), math.pi)
             drift = s.voltage_uncertainty * elapsed
