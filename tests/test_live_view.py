@@ -119,10 +119,10 @@ def test_what_others_say_is_put_into_ascii_where_there_is_no_more() -> None:
 
 
 def test_lines_for_pipes_tell_the_gravest_finding() -> None:
-    from ipmsm_can.cli.live_view import _line
+    from ipmsm_can.cli.live_view_session import line
 
-    assert _line(STATUS).endswith("lost 7 bad 8 | error: The frames take 97 % of the bus time, so others wait.")
-    assert _line(replace(STATUS, findings=STATUS.findings[2:])).endswith("lost 7 bad 8")
+    assert line(STATUS).endswith("lost 7 bad 8 | error: The frames take 97 % of the bus time, so others wait.")
+    assert line(replace(STATUS, findings=STATUS.findings[2:])).endswith("lost 7 bad 8")
 
 
 def test_findings_have_a_page_with_advice() -> None:

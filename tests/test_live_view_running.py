@@ -28,6 +28,7 @@ from ipmsm_can.live_view.control import Controls
 from ipmsm_can.live_view.judging import Batch, Judge, Plan
 from ipmsm_can.live_view.keys import TAB, decode
 from ipmsm_can.live_view.recording import KeyRecording
+from ipmsm_can.live_view.sight import WireSight
 from ipmsm_can.live_view.status import FINDINGS, HELP, MonitorStatus, Told
 from ipmsm_can.live_view.taking import FrameClock, LiveView
 from ipmsm_can.live_view.watch import MOST_FRAMES, Watch
@@ -70,7 +71,7 @@ class Stage:
         self.controls = Controls(self.companion, None, self._quit, self.clock.now_ns, self.clock.words,
                                  threading.Event(), lambda: self.passed)
         self.watch = Watch(None, lambda: "now")
-        self.view = LiveView(self.runner, self.controls, self.watch, self.clock)
+        self.view = LiveView(WireSight(self.runner), self.controls, self.watch, self.clock)
         self.answers: list[FrameBlock] = []
 
     def _quit(self) -> None:
@@ -471,5 +472,5 @@ def test_the_bus_going_away_is_not_hidden_by_a_pause(monkeypatch: pytest.MonkeyP
     stage = Stage(transmit=False)
     stage.go(0.1)
     stage.press("p")
-    monkeypatch.setattr(stage.view.monitor, "_no_bus", lambda: "no bus since 14:00:00: can0 is down")
+    monkeypatch.setattr(stage.view.sight.monitor, "_no_bus", lambda: "no bus since 14:00:00: can0 is down")
     assert stage.view.status().run.bus.no_bus == "no bus since 14:00:00: can0 is down"

@@ -30,6 +30,7 @@ from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view.control import Controls
 from ipmsm_can.live_view.judging import Batch, BusSource, Judge, Plan
+from ipmsm_can.live_view.sight import WireSight
 from ipmsm_can.live_view.taking import FrameClock, LiveView
 from ipmsm_can.live_view.watch import Watch
 from ipmsm_can.motor import M2
@@ -80,7 +81,7 @@ def run(hours: float, warm_up_hours: float, thorough: bool = True) -> Growth:
     judge = Judge({"the bus": BusSource(Plan((config,), (1_000_000, 5_000_000), True))} if thorough else {})
     watch = Watch(None, lambda: clock.words(clock.now_ns()), controls.note_finding)
     watch.begin(("the bus",))
-    view = LiveView(runner, controls, watch, clock)
+    view = LiveView(WireSight(runner), controls, watch, clock)
 
     def second(k: int) -> None:
         shift = k * 10**9

@@ -3,31 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
-import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ipmsm_can.cli import bus, recording
+from ipmsm_can.cli import live_view_session as session
 
 if TYPE_CHECKING:
-    from ipmsm_can.bus.link import Link
-    from ipmsm_can.bus.live import LiveRunner
     from ipmsm_can.bus.port import Port
     from ipmsm_can.config import DriveConfig
     from ipmsm_can.drive.profile import Profile
-    from ipmsm_can.frames import FrameBlock
-    from ipmsm_can.live_view.judging import Batch, Plan
-    from ipmsm_can.live_view.recording import KeyRecording
+    from ipmsm_can.live_view.judging import Plan
     from ipmsm_can.live_view.status import MonitorStatus
-    from ipmsm_can.live_view.taking import LiveView
-    from ipmsm_can.record.tap import Tap
     from ipmsm_can.wire.protocol import Protocol
 
 HELP = """\
@@ -55,9 +45,6 @@ _FASTEST, _SLOWEST = 100.0, 0.01
 _DEMO_ROUNDS = 250
 """How often the demo's profile is repeated: over an hour."""
 _DEMO_THETA = math.radians(70.0)
-_BLOCK_FRAMES = 2048
-_TURN_S = 0.001
-_TOLD_AT_THE_END = ("mark ", "recording ", "cannot record", "drive ")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -98,10 +85,8 @@ def main(args: argparse.Namespace) -> int:
     from ipmsm_can.companion import Companion
     from ipmsm_can.config import config_from, load_configs
     from ipmsm_can.config.build import build_protocol
-    from ipmsm_can.live_view.control import Controls
     from ipmsm_can.live_view.course import warm_up
-    from ipmsm_can.live_view.taking import FrameClock, LiveView
-    from ipmsm_can.live_view.watch import Watch
+    from ipmsm_can.live_view.sight import WireSight
 
     configs = load_configs(args.configs) if args.configs else (
         config_from({"motor": {"preset": "m2"}}, source="demo"),)
@@ -114,27 +99,15 @@ def main(args: argparse.Namespace) -> int:
         warm_up_companion(configs, protocol)
         warm_up()
     configs, open_port, source = _opener(args, configs, protocol)
-    with (_stop(args.duration) as stop, _short_turns(), open_port() as port,
+    with (session.stop_in_order(args.duration) as stop, session.short_turns(), open_port() as port,
           Link(port, open_port, transmits=args.transmit) as link,
-          _recording(args, link, configs, protocol) as (record, tap)):
+          session.key_recording(args, link, configs, protocol) as (record, tap)):
         runner = LiveRunner(port, Companion(configs, protocol, args.transmit), *rates,
                             None if args.no_reconnect else link)
-        clock, news = FrameClock(of_day=args.log is None), threading.Event()
-        controls = Controls(runner.companion, record, lambda: stop.now("q"), clock.now_ns, clock.words, news)
-        if args.record:
-            controls.toggle_record()
-        watch = Watch(_plan(args, configs, rates), lambda: clock.words(clock.now_ns()), controls.note_finding,
-                      _notes(link))
-        view = LiveView(runner, controls, watch, clock, source, tap.status)
-        view.ascii = args.ascii or not _is_utf8()
-
-        def ends() -> bool:
-            over = getattr(link.port, "finished", False)
-            if over and view.keys:
-                view.hold_at_end()
-            return bool(stop()) or (over and not view.keys)
-
-        code, last = _serve(runner, view, news, ends)
+        view, news = session.build_view(args, WireSight(runner, tap.status), runner.companion, link, record,
+                                        _plan(args, configs, rates), stop, source)
+        ends = session.ends_with(view, link, stop)
+        code, last = session.serve(lambda: runner.run(ends, view.observe), view, news)
     code = max(code, recording.code_of(tap), int(record is not None and not record.whole))
     if link.down:
         print(f"ipmsm-can monitor: there is {link.words}", file=sys.stderr)
@@ -169,14 +142,11 @@ def _opener(args: argparse.Namespace, configs: tuple[DriveConfig, ...], protocol
     if args.log is not None:
         from ipmsm_can.bus.playback import LogPort
         from ipmsm_can.bus.replay import prepare
-        from ipmsm_can.logs import read_log
 
-        reader = read_log(Path(args.log), block_frames=_BLOCK_FRAMES, channel=getattr(args, "channel", None))
-        chosen, blocks = prepare(configs, protocol, reader)
-        speed = args.speed or 1.0
-        words = f"{Path(args.log).name}, played" + (f" {speed:g} times as fast" if speed != 1.0 else "")
+        args.reader = session.open_log(args)
+        chosen, blocks = prepare(configs, protocol, args.reader)
+        speed, words = session.played(args)
         played = LogPort(blocks, speed, words)
-        args.reader = reader
         return tuple(chosen), lambda: played, words
     if args.demo:
         from ipmsm_can.bus.simulated import SimulatedPort
@@ -211,78 +181,6 @@ def _plan(args: argparse.Namespace, configs: tuple[DriveConfig, ...], rates: tup
     return Plan(configs, rates, error_classes=args.log is None or ".log" in Path(args.log).suffixes)
 
 
-def _notes(link: Link) -> Callable[[FrameBlock], Batch]:
-    """Frames with what the port knows beside them."""
-    from ipmsm_can.bus.socketcan import SocketCanPort
-    from ipmsm_can.live_view.judging import Batch
-
-    counts_drops = isinstance(link.port, SocketCanPort)
-    return lambda block: Batch(block, link.drops if counts_drops else -1, link.outages, link.outage_time,
-                               link.words)
-
-
-@contextmanager
-def _recording(args: argparse.Namespace, link: Link, configs: tuple[DriveConfig, ...],
-               protocol: Protocol) -> Iterator[tuple[KeyRecording | None, Tap]]:
-    """What the keys record with, None where a recording is played; and what feeds it and --measure."""
-    from ipmsm_can.live_view.recording import KeyRecording
-    from ipmsm_can.logs.writer import warm_up
-
-    path = None if args.record is None else Path(args.record)
-    own = argparse.Namespace(**{**vars(args), "record": None})
-    with recording.recordings(own, link, configs, protocol) as tap:
-        if args.log is not None:
-            yield None, tap
-            return
-        with bus.patience():
-            warm_up()
-        record = KeyRecording(tap, str(getattr(args, "channel", None) or "can0"), path, recording.rotation(args))
-        try:
-            yield record, tap
-        finally:
-            record.stop()
-            with contextlib.suppress(OSError):  # a terminal that hung up
-                print("".join(f"{words}\n" for words in record.summaries), end="")
-
-
-def _serve(runner: LiveRunner, view: LiveView, news: threading.Event,
-           stop: Callable[[], bool]) -> tuple[int, MonitorStatus]:
-    """Run until it ends, with the screen; print how it went.  Returns the exit code and the last status."""
-    from ipmsm_can.bus.port import BusError
-    from ipmsm_can.cli import plain
-    from ipmsm_can.cli.screen import Screen, is_terminal
-    from ipmsm_can.live_view.keys import Keys
-
-    gone: BusError | None = None
-    keys = Keys(view.controls.press)
-    keys.available = view.keys = keys.available and is_terminal(sys.stdout)
-    with view.watch, Screen(view.status, drawer="ipmsm_can.live_view.drawing", line=_line, news=news), keys:
-        try:
-            runner.run(stop, view.observe)
-        except BusError as error:
-            gone = error
-    view.controls.paused = view.over  # a recording is summed up as it was, not as the silence after it
-    view.controls.stop_record()
-    last = view.status()
-    with contextlib.suppress(OSError):  # a terminal that hung up
-        print(plain.summary(last.run))
-        for event in last.events:
-            if event.words.startswith(_TOLD_AT_THE_END):
-                print(f"{event.time} {event.words}")
-        sys.stdout.flush()
-    if gone is not None:
-        print(f"ipmsm-can monitor: the bus went away after {last.run.elapsed:.1f} s: {gone}", file=sys.stderr)
-    return int(gone is not None), last
-
-
-def _line(status: MonitorStatus) -> str:
-    """For pipes: as of `run`, and the gravest finding."""
-    from ipmsm_can.cli import plain
-
-    first = next((f for f in status.findings if f.severity != "notice"), None)
-    return plain.line(status.run) + (f" | {first.severity}: {first.sentence}" if first else "")
-
-
 def _verdict(args: argparse.Namespace, last: MonitorStatus) -> int:
     """Exit code where the bus was there: was there a drive on it, and was the log whole?"""
     code = 0
@@ -293,52 +191,4 @@ def _verdict(args: argparse.Namespace, last: MonitorStatus) -> int:
               file=sys.stderr)
         code = 1 if args.log is None else 2
     reader = getattr(args, "reader", None)
-    if reader is not None and (reader.problem or reader.bad_lines):
-        told = reader.problem or f"{args.log} is damaged: {reader.bad_lines} of its lines cannot be read"
-        print(f"ipmsm-can monitor: {told}; what was readable was played", file=sys.stderr)
-        code = 2
-    return code
-
-
-@contextmanager
-def _stop(duration: float | None) -> Iterator[bus.Stop]:
-    """As `bus.stop_on_signals`; a connection that hangs up ends the program in order, too, so that a record is
-    finished."""
-    with bus.stop_on_signals(duration) as stop:
-        number = getattr(signal, "SIGHUP", None)
-        if number is None or threading.current_thread() is not threading.main_thread():
-            yield stop
-            return
-        before = signal.signal(number, lambda *_: stop.now("SIGHUP"))
-        try:
-            yield stop
-        finally:
-            signal.signal(number, before)
-
-
-@contextmanager
-def _short_turns() -> Iterator[None]:
-    """The receiving thread must not wait for the others' turns of 5 ms."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(_TURN_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-
-
-def _is_utf8() -> bool:
-    """Whether the terminal takes more than ASCII, as far as its locale and kind say."""
-    encoding = (getattr(sys.stdout, "encoding", "") or "").lower().replace("-", "")
-    # the console of the Linux kernel has no braille in its font
-    return encoding == "utf8" and os.environ.get("TERM") != "linux" and _locale_is_utf8()
-
-
-def _locale_is_utf8() -> bool:
-    if sys.platform == "win32":
-        return True
-    # Where LANG is C, Python takes UTF-8 for itself, and sets LC_CTYPE so: neither tells of the terminal.
-    ours = os.environ.get("LC_CTYPE") == "C.UTF-8"
-    names = ("LC_ALL", "LANG") if ours else ("LC_ALL", "LC_CTYPE", "LANG")
-    said = next((value for name in names if (value := os.environ.get(name))), "C")
-    return "utf8" in said.lower().replace("-", "")
+    return code if reader is None else session.damage(args, reader) or code

@@ -5,23 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import time
 from typing import TYPE_CHECKING
 
 from ipmsm_can.cli import bus, recording
-from ipmsm_can.cli.status import BusStatus, NodeStatus, RunStatus
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ipmsm_can.bus.health_report import HealthReport
-    from ipmsm_can.bus.listen import Listener
+    from ipmsm_can.config import DriveConfig
     from ipmsm_can.frames import FrameBlock
     from ipmsm_can.mapping.follow import Follower
+    from ipmsm_can.mapping.plan import Plan
     from ipmsm_can.node import Tracked
-    from ipmsm_can.record.tap import Tap
-
-_SILENT_NS = 500_000_000
 
 
 def run_mapped(args: argparse.Namespace) -> int:
@@ -31,21 +26,11 @@ def run_mapped(args: argparse.Namespace) -> int:
     from ipmsm_can.bus.listen import Listener
     from ipmsm_can.bus.port import bus_configuration
     from ipmsm_can.bus.socketcan import SocketCanPort
-    from ipmsm_can.config import load_configs
-    from ipmsm_can.mapping import load_map, make_plan
+    from ipmsm_can.cli.mapped_monitor import MappedMonitor
     from ipmsm_can.mapping.follow import Follower
 
-    if len(args.configs) != 1:
-        raise ValueError(f"--map takes one drive.toml, and there are {len(args.configs)}")
-    if args.transmit:
-        raise ValueError("--transmit does not go with --map: a mapped inverter knows none of our messages, so "
-                         "nothing is ever sent to it")
-    if args.measure:
-        raise ValueError("--measure does not go with --map: it holds the messages of ipmsm_can.dbc; --record does, "
-                         "and `ipmsm-can replay LOG --map` makes rows of the log")
-    config = load_configs(args.configs)[0]
+    config, plan = load_mapped(args)
     rates = bus.bit_rates(args, [config])
-    plan = make_plan(load_map(args.map), node=args.node, pole_pairs=config.build_motor().pole_pairs)
     bus.check_named(args)
     recording.check(args)
     socketcan = bus_configuration(args)[0]["interface"] == "socketcan"
@@ -61,13 +46,13 @@ def run_mapped(args: argparse.Namespace) -> int:
             follower.feed(block)
 
         listener = Listener(link, health, isinstance(port, SocketCanPort), not args.no_reconnect, observe)
-        monitor = MappedMonitor(listener, follower, tap)
+        monitor = MappedMonitor(listener, follower, records=tap.status)
         def listen() -> None:
             listener.run(stop)
             follower.flush()
 
         code, status = bus.serve("run", listen, monitor.status, args.quiet)
-    _tell(follower, status.elapsed)
+    tell(follower, status.elapsed)
     if link.down:
         print(f"ipmsm-can run: there is {link.words}", file=sys.stderr)
         code = 1
@@ -75,6 +60,23 @@ def run_mapped(args: argparse.Namespace) -> int:
         print(f"ipmsm-can run: no sample of the map {args.map} could be used: {follower.verdict}", file=sys.stderr)
         code = 1
     return max(code, recording.code_of(tap))
+
+
+def load_mapped(args: argparse.Namespace) -> tuple[DriveConfig, Plan]:
+    """Configuration and plan of the drive.  Raises ValueError for options that do not go with --map."""
+    from ipmsm_can.config import load_configs
+    from ipmsm_can.mapping import load_map, make_plan
+
+    if len(args.configs) != 1:
+        raise ValueError(f"--map takes one drive.toml, and there are {len(args.configs)}")
+    if args.transmit:
+        raise ValueError("--transmit does not go with --map: a mapped inverter knows none of our messages, so "
+                         "nothing is ever sent to it")
+    if args.measure:
+        raise ValueError("--measure does not go with --map: it holds the messages of ipmsm_can.dbc; --record does, "
+                         "and `ipmsm-can replay LOG --map` makes rows of the log")
+    config = load_configs(args.configs)[0]
+    return config, make_plan(load_map(args.map), node=args.node, pole_pairs=config.build_motor().pole_pairs)
 
 
 def warm_up(health: object, follower: Follower) -> None:
@@ -105,7 +107,7 @@ def warm_up(health: object, follower: Follower) -> None:
     spare.report()
 
 
-def _tell(follower: Follower, elapsed: float) -> None:
+def tell(follower: Follower, elapsed: float) -> None:
     """What was found, after the summary."""
     for note in follower.notes:
         print(f"note: {note}")
@@ -119,67 +121,3 @@ def _tell(follower: Follower, elapsed: float) -> None:
             print(f"reported angle: the estimate is {math.degrees(s.encoder.rms):.3f} deg rms off it, "
                   f"{math.degrees(s.encoder.largest):.3f} deg at most (electrical), at {s.encoder.compared} valid "
                   f"samples of {elapsed:.1f} s")
-
-
-class MappedMonitor:
-    """Takes a `RunStatus` from a listener and a follower; may be called from another thread."""
-
-    def __init__(self, listener: Listener, follower: Follower, tap: Tap) -> None:
-        from ipmsm_can.cli.monitor import Rates
-
-        self._listener = listener
-        self._follower = follower
-        self._tap = tap
-        self._begin = time.monotonic()
-        self._rates = Rates(self._begin)
-        self._ever = 0
-
-    def status(self) -> RunStatus:
-        """As of now."""
-        now = time.monotonic()
-        report = self._listener.report()
-        rates = self._rates.update(now, {"frames": report.frames, "samples": self._follower.samples})
-        return RunStatus("ipmsm-can run --map", now - self._begin, False, self._bus(report, rates["frames"]),
-                         (self._node(report, rates["samples"]),), self._tap.status())
-
-    def _bus(self, r: HealthReport, frames_per_s: float) -> BusStatus:
-        link = self._listener.link
-        e = r.errors
-        told = f"{e.frames} error frames" + (f", controller {e.state}" if e.state else "") if e.frames else (
-            "no error frames")
-        return BusStatus(
-            description=r.source, load=r.load, frames=r.frames, frames_per_s=frames_per_s, sent=0, unsent=0, late=0,
-            unknown=0, remote=sum(i.remote for i in r.ids), wrong_length=0, drops=max(0, r.kernel_drops),
-            error_frames=e.frames, errors=told, turnaround_p50=math.nan, turnaround_p99=math.nan, no_bus=r.no_bus,
-            outages=link.outages, outage_time=link.outage_time)
-
-    def _node(self, r: HealthReport, samples_per_s: float) -> NodeStatus:
-        from ipmsm_can.cli.monitor import RPM
-        from ipmsm_can.estimation import confidence
-
-        follower = self._follower
-        tracking = follower.tracking
-        motor = follower.config.build_motor()
-        flowing = follower.samples > 0 and 1e9 * r.last - follower.last_ns < _SILENT_NS and not r.no_bus
-        live = flowing and tracking is not None
-        theta, omega, sigma, flags, excitation = (tracking.latest if tracking is not None else
-                                                  (math.nan, 0.0, math.pi, 0, 0.0))
-        self._ever |= flags
-        flags = flags if live else 0
-        state = follower.verdict.partition(":")[0]  # the reason is told at the end: it takes more than a line
-        if tracking is not None:
-            state = ("locked" if flags & confidence.LOCKED else "tracking, not locked") if flowing else (
-                "no samples any more")
-        delay = tracking.estimator.voltage_delay if tracking is not None else None
-        return NodeStatus(
-            node=follower.config.wire.node, motor=motor.name, state=state, live=live, theta=theta, sigma=sigma,
-            omega=omega, rpm=omega / motor.pole_pairs * RPM, valid=bool(flags & confidence.VALID),
-            locked=bool(flags & confidence.LOCKED), polarity_known=bool(flags & confidence.POLARITY_KNOWN),
-            excitation=excitation, injection="none: a mapped inverter is only listened to", injecting=False,
-            amplitude=0.0, hf_current=0.0, sample_rate=follower.rate,
-            samples_per_s=samples_per_s, estimates_per_s=samples_per_s if live else 0.0, received=follower.samples,
-            lost=tracking.lost if tracking else 0, filled=tracking.filled if tracking else 0, gaps=0, duplicates=0,
-            reordered=0, resyncs=0, restarts=0, bad_frames=tracking.unusable if tracking else 0,
-            rejected_commands=0, timing=delay.words if delay is not None and delay.applied else "",
-            ever_locked=tracking is None or bool(self._ever & confidence.LOCKED),
-            ever_valid=tracking is None or bool(self._ever & confidence.VALID))

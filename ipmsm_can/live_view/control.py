@@ -19,6 +19,7 @@ EVENTS_KEPT = 200
 BINS_EACH = (1, 2, 4, 8)
 """Tenths of a second that a column of the curves stands for, in the order of the key."""
 NOTICE_S = 5.0
+ONLY_LISTENED = "SILENT: a mapped inverter is only listened to; it knows none of our messages"
 _FLOWING = (CompanionState.STARTING, CompanionState.TRACKING, CompanionState.LOCKED, CompanionState.FAULT)
 
 
@@ -57,15 +58,16 @@ class Recording(Protocol):
 class Controls:
     """State behind the keys.
 
-    companion: whose injection they order.  recording: None where there is nothing to record.
-    quit: ends the program.  now_ns: the time on the frames' axis.  stamp: that in words.  news: set after each key,
-    so that the screen answers at once.
+    companion: whose injection they order; None: there is one drive, which is only listened to.  recording: None
+    where there is nothing to record.  quit: ends the program.  now_ns: the time on the frames' axis.  stamp: that
+    in words.  news: set after each key, so that the screen answers at once.
     """
 
-    def __init__(self, companion: Companion, recording: Recording | None, quit_: Callable[[], None],
+    def __init__(self, companion: Companion | None, recording: Recording | None, quit_: Callable[[], None],
                  now_ns: Callable[[], int], stamp: Callable[[int], str], news: threading.Event,
                  clock: Callable[[], float] = time.monotonic) -> None:
         self.companion = companion
+        self._nodes = {} if companion is None else companion.nodes
         self.page = MAIN
         self.paused = False
         self.selected = 0
@@ -175,19 +177,21 @@ class Controls:
         self.page = MAIN if self.page == page else page
 
     def _next_drive(self) -> None:
-        self.selected = (self.selected + 1) % max(1, len(self.companion.nodes))
+        self.selected = (self.selected + 1) % max(1, len(self._nodes))
 
     # Injection
 
     @property
     def _node(self) -> int:
-        return list(self.companion.nodes)[self.selected]
+        return list(self._nodes)[self.selected]
 
     def _cannot_inject(self) -> str:
         """Why there is nothing to order, "" where there is."""
+        if self.companion is None:
+            return ONLY_LISTENED
         if not self.companion.transmit:
             return "SILENT: nothing is transmitted, so nothing can be ordered; start with --transmit for that"
-        scheduler = self.companion.nodes[self._node].scheduler
+        scheduler = self._nodes[self._node].scheduler
         if (scheduler.state is InjectionState.DISABLED
                 and scheduler.reason is InjectionReason.DISABLED_BY_CONFIGURATION):
             return "the drive's TOML file says injection.enabled = false"
@@ -195,12 +199,13 @@ class Controls:
 
     def _ask_to_inject(self) -> None:
         why = self._cannot_inject()
-        number = self._node
-        node = self.companion.nodes[number]
-        if not why and node.view.state not in _FLOWING:
-            why = f"drive {number} sends no samples: there is nothing to inject into"
         if why:
             self.tell(why)
+            return
+        number = self._node
+        node = self._nodes[number]
+        if node.view.state not in _FLOWING:
+            self.tell(f"drive {number} sends no samples: there is nothing to inject into")
             return
         s = node.scheduler.settings
         self.tell(f"inject {s.amplitude:.1f} V at {s.frequency:.0f} Hz into drive {number}?  "
@@ -219,6 +224,7 @@ class Controls:
         self.tell(f"drive {number}: injection ordered {told}")
 
     def _carry_out(self, number: int, wanted: bool | None) -> None:
+        assert self.companion is not None
         self.companion.order_injection(number, wanted)
         if wanted is None:
             self.orders.pop(number, None)
@@ -229,6 +235,6 @@ class Controls:
         """An order to inject ends where the samples do: whoever switches the drive on again must not find it
         injecting for an order that was given before.  The receiving thread's, once a round."""
         for number, wanted in list(self.orders.items()):
-            if wanted and self.companion.nodes[number].view.state not in _FLOWING:
+            if wanted and self._nodes[number].view.state not in _FLOWING:
                 self._carry_out(number, None)
                 self.note(f"drive {number}: no samples, so the order to inject has ended")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ipmsm_can.estimation import speed
 from ipmsm_can.live_view.course_kernel import BIN, BIN_NS, add_block
 from ipmsm_can.live_view.status import Course
+from ipmsm_can.mapping.mapper import MappedBlock
 from ipmsm_can.node import Tracked
 
 Floats = NDArray[np.float64]
@@ -51,13 +52,36 @@ class CourseRing:
         self._bins["key"] = -1
         self._newest = np.full(1, -1, np.int64)
         self._rate = math.nan
+        self._axes = True
+        """There is a d and a q, of the estimate or of the drive itself."""
 
     def add(self, part: Tracked) -> None:
         """Take in samples with their estimates; the same bits for any cut into blocks."""
         e = part.estimate
-        self._rate = part.run.sample_rate
+        self._rate, self._axes = part.run.sample_rate, True
         add_block(part.run.values, part.run.t_ns, e.angle[speed.THETA_HAT], e.angle[speed.OMEGA], e.sigma, KNOWN,
                   self._bins, self._newest)
+
+    def add_reported(self, part: MappedBlock, spoils: int) -> None:
+        """Take in samples as the drive reports them: its own speed, currents and voltages in its own d and q, and
+        no angle.  spoils: bits of quality that make d and q doubtful (`convert.spoils_dq`)."""
+        if not len(part):
+            return
+        in_dq = np.isfinite(part.i_d + part.i_q) & (part.quality & spoils == 0)
+        values = np.where(in_dq, [part.i_d, part.i_q, part.v_d, part.v_q],
+                          [part.i_alpha, part.i_beta, part.v_alpha, part.v_beta])
+        self._axes = bool(in_dq[-1])
+        use = np.isfinite(values[:2]).all(axis=0)
+        values, t_ns = np.ascontiguousarray(values[:, use]), part.t_ns[use]
+        omega = np.where(np.isfinite(part.omega_e), part.omega_e, part.turning)[use]
+        # In their own frame they stand at angle 0, wherever that is: its 1-sigma is "unknown", and yet they count.
+        theta = np.where(np.isfinite(omega), 0.0, np.nan)
+        add_block(values, t_ns, theta, omega, np.full(t_ns.size, math.pi), math.inf, self._bins, self._newest)
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._bins["key"] = -1
+        self._newest[0] = -1
 
     def present(self) -> Present:
         """As of the newest samples.
@@ -79,8 +103,8 @@ class CourseRing:
             omega=float(bins["omega"].sum()) / aligned if aligned else math.nan,
             omega_sigma=math.hypot(begin, end) / span if known else math.nan,
             i_rms=math.sqrt(float(bins["i2"].sum()) / n / 2.0), i_peak=math.sqrt(float(bins["i2_max"].max())),
-            i_d=float(bins["i_d"].sum()) / aligned if aligned else math.nan,
-            i_q=float(bins["i_q"].sum()) / aligned if aligned else math.nan,
+            i_d=float(bins["i_d"].sum()) / aligned if aligned and self._axes else math.nan,
+            i_q=float(bins["i_q"].sum()) / aligned if aligned and self._axes else math.nan,
             v_rms=math.sqrt(float(bins["v2"].sum()) / n / 2.0))
 
     def columns(self, now_ns: int, count: int, bins_each: int, rpm_per_omega: float) -> Course:

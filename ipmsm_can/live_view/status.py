@@ -44,7 +44,8 @@ class DriveView:
     i_rms: phase current [A rms]; i_peak: longest current vector of that time, which is the largest phase current
     [A peak]; i_d, i_q: mean along the estimated axes [A peak], NaN without an angle; v_rms: phase voltage [V rms].
     rated: rated phase current [A rms].  order: "on", "off" or "" for automatic: what the operator asked of the
-    injection.
+    injection.  reported: speed, i_d and i_q are what the drive itself reports, for there is no estimate.
+    figures: what else is known, as (name, words).
     """
 
     node: NodeStatus
@@ -58,6 +59,8 @@ class DriveView:
     rated: float
     order: str
     course: Course
+    reported: bool = False
+    figures: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

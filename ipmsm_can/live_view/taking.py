@@ -1,4 +1,4 @@
-"""Takes what the screen shows from a running companion, next to `cli.monitor`."""
+"""Takes what the screen shows: the drives through a `Sight`, and what keys, findings and recordings add."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from ipmsm_can.bus.live import LiveRunner
-from ipmsm_can.cli.monitor import RPM, RunMonitor
+from ipmsm_can.cli.monitor import RPM
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view.control import BINS_EACH, Controls
-from ipmsm_can.live_view.course import CourseRing
+from ipmsm_can.live_view.sight import Sight
 from ipmsm_can.live_view.status import DriveView, MonitorStatus
 from ipmsm_can.live_view.watch import Watch
 from ipmsm_can.node import Tracked
-from ipmsm_can.record.status import RecordStatus
 
 COLUMNS = 240
 """Columns of the curves that are worked out: enough for a very wide terminal."""
@@ -60,24 +58,20 @@ class FrameClock:
 class LiveView:
     """Hands out `MonitorStatus`: `observe` is the runner's observer, `status` may be called from another thread.
 
-    source: where the frames come from, in words; None: what the port says.  records: what is recorded.
+    sight: the drives.  source: where the frames come from, in words; None: what the port says.
     """
 
-    def __init__(self, runner: LiveRunner, controls: Controls, watch: Watch, clock: FrameClock,
-                 source: str | None = None, records: Callable[[], tuple[RecordStatus, ...]] = tuple) -> None:
-        self.monitor = RunMonitor(runner, "ipmsm-can monitor", records)
+    def __init__(self, sight: Sight, controls: Controls, watch: Watch, clock: FrameClock,
+                 source: str | None = None) -> None:
+        self.sight = sight
         self.controls = controls
         self.watch = watch
         self.keys = True
         self.ascii = False
-        self._runner = runner
         self._clock = clock
         self._source = source
-        nodes = runner.companion.nodes
-        self._courses = {number: CourseRing() for number in nodes}
-        motors = {number: node.config.build_motor() for number, node in nodes.items()}
-        self._rpm = {number: RPM / motor.pole_pairs for number, motor in motors.items()}
-        self._rated = {number: motor.rated_current / math.sqrt(2.0) for number, motor in motors.items()}
+        self._rpm = {number: RPM / motor.pole_pairs for number, motor in sight.motors.items()}
+        self._rated = {number: motor.rated_current / math.sqrt(2.0) for number, motor in sight.motors.items()}
         self._held: MonitorStatus | None = None
         self._taking = threading.Lock()
         self.over = False
@@ -86,9 +80,7 @@ class LiveView:
     def observe(self, block: FrameBlock, tracked: Sequence[Tracked], answers: FrameBlock, now_ns: int) -> None:
         """Note a round: a few microseconds."""
         self._clock.update(now_ns)
-        self.monitor.observe(block, tracked, answers, now_ns)
-        for part in tracked:
-            self._courses[part.node].add(part)
+        self.sight.observe(block, tracked, answers, now_ns)
         recording = self.controls.recording
         if recording is not None:
             recording.observe(block, tracked, answers, now_ns)
@@ -114,7 +106,7 @@ class LiveView:
         run = held.run
         if controls.paused:
             # the clock, the voice and the bus must not seem to stand still
-            now = self.monitor.status()
+            now = self.sight.status()
             run = replace(run, elapsed=now.elapsed, transmit=now.transmit,
                           bus=replace(run.bus, no_bus=now.bus.no_bus))
         return replace(
@@ -129,19 +121,21 @@ class LiveView:
             return self._take()
 
     def _take(self) -> MonitorStatus:
-        run = self.monitor.status()
+        run = self.sight.status()
         drives = []
         for node in run.nodes:
             number = node.node
-            present = self._courses[number].present()
+            course = self.sight.courses[number]
+            present = course.present()
+            aside = self.sight.aside(number)
             factor = self._rpm[number]
             wanted = self.controls.orders.get(number)
             drives.append(DriveView(
                 node=node, rpm=present.omega * factor, rpm_sigma=present.omega_sigma * factor, i_rms=present.i_rms,
                 i_peak=present.i_peak, i_d=present.i_d, i_q=present.i_q, v_rms=present.v_rms,
                 rated=self._rated[number], order="" if wanted is None else "on" if wanted else "off",
-                course=self._courses[number].columns(self._clock.now_ns(), COLUMNS, BINS_EACH[self.controls.zoom],
-                                                     factor)))
+                course=course.columns(self._clock.now_ns(), COLUMNS, BINS_EACH[self.controls.zoom], factor),
+                reported=aside.reported, figures=aside.figures))
         return MonitorStatus(
             run=run, drives=tuple(drives), source=run.bus.description if self._source is None else self._source,
             keys=self.keys, injectable=run.transmit, ascii=self.ascii)

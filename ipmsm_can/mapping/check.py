@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ipmsm_can.frames import CAN_EFF_FLAG, CAN_EFF_MASK
 from ipmsm_can.mapping.convert import QUALITY
-from ipmsm_can.mapping.plan import CONSTANT, COUNTER, OMEGA, RATE, Channel
+from ipmsm_can.mapping.plan import CONSTANT, COUNTER, OMEGA, RATE, Channel, Plan
 from ipmsm_can.mapping.survey import SignalFigures, Survey
 from ipmsm_can.wire.sequence_kernel import RATE_MIN
 
@@ -184,8 +185,13 @@ def text(survey: Survey, log: str, name: str) -> str:
 
 def wrong_bus(survey: Survey, log: str) -> str:
     """Why a log without any frame of the map is of no use, in one sentence."""
-    wanted = ", ".join(identifier(s.can_id) for s in survey.plan.sources)
-    seen = [identifier(i) for i in sorted(survey.identifiers)]
+    return no_frame(survey.plan, survey.identifiers, log)
+
+
+def no_frame(plan: Plan, identifiers: Iterable[int], log: str) -> str:
+    """The same of identifiers that were seen, with CAN_EFF_FLAG where they have 29 bits."""
+    wanted = ", ".join(identifier(s.can_id) for s in plan.sources)
+    seen = [identifier(i) for i in sorted(identifiers)]
     more = f" and {len(seen) - _IDS_SHOWN} more" if len(seen) > _IDS_SHOWN else ""
     return (f"{log} holds no frame of the map (identifiers {wanted}); seen were "
             f"{', '.join(seen[:_IDS_SHOWN]) or 'no identifiers at all'}{more}")

@@ -102,18 +102,27 @@ class SteadyState:
         time_s = np.asarray(1e-9 * (b.t_ns - (self._t0 or 0)), np.float64)
         return SteadyRows(time_s, psi, rest, torque, power, steady)
 
+    def figures(self) -> list[tuple[str, str]]:
+        """What was found, as (name, words)."""
+        m = self.motor
+        found = []
+        if self.steady:
+            found += [("psi_m", f"{self.psi_m.mean:.4g} Wb, scatter {self.psi_m.deviation:.2g}; drive.toml has "
+                       f"{m.psi_m:.4g}"),
+                      ("v_d", f"{self.v_d_rest.mean:+.3g} V from what R, L_q and the speed explain, scatter "
+                       f"{self.v_d_rest.deviation:.2g}")]
+        if self.power.count:
+            found.append(("power", f"{self.power.mean:.4g} W into the motor on average"))
+        if self.torque_rest.count:
+            found.append(("torque", f"reported is {self.torque_rest.mean:+.3g} N m off what the currents and "
+                          "drive.toml give"))
+        return found
+
+    @property
+    def judged(self) -> str:
+        """How much there is to judge by, in words."""
+        return f"{self.rows} samples, {self.steady} of them steady enough to judge by"
+
     def words(self) -> list[str]:
         """What was found, a line each."""
-        m = self.motor
-        lines = [f"{self.rows} samples, {self.steady} of them steady enough to judge by"]
-        if self.steady:
-            lines += [f"psi_m      {self.psi_m.mean:.4g} Wb, scatter {self.psi_m.deviation:.2g}; drive.toml has "
-                      f"{m.psi_m:.4g}",
-                      f"v_d        {self.v_d_rest.mean:+.3g} V from what R, L_q and the speed explain, scatter "
-                      f"{self.v_d_rest.deviation:.2g}"]
-        if self.power.count:
-            lines.append(f"power      {self.power.mean:.4g} W into the motor on average")
-        if self.torque_rest.count:
-            lines.append(f"torque     reported is {self.torque_rest.mean:+.3g} N m off what the currents and "
-                         "drive.toml give")
-        return lines
+        return [self.judged, *(f"{name:11}{words}" for name, words in self.figures())]

@@ -15,11 +15,13 @@ from ipmsm_can.bus.rows import RowBlock
 from ipmsm_can.config.build import estimator_settings
 from ipmsm_can.config.model import DriveConfig
 from ipmsm_can.estimation import confidence, speed
-from ipmsm_can.estimation.estimator import Estimator, EstimatorSettings
+from ipmsm_can.estimation.estimator import EstimateBlock, Estimator, EstimatorSettings
 from ipmsm_can.estimation.observers import ges
 from ipmsm_can.mapping.convert import ANGLE_APART, CURRENT_APART, VOLTAGE_APART
 from ipmsm_can.mapping.mapper import MappedBlock
 from ipmsm_can.mapping.model import InverterMap
+from ipmsm_can.node import Tracked
+from ipmsm_can.wire.sequence import SampleRun
 from ipmsm_can.wire.sequence_kernel import RESTARTED
 
 Floats = NDArray[np.float64]
@@ -81,19 +83,25 @@ class MappedTracking:
     """The estimator over the samples of a map, at a rate that allows it.
 
     summary: as of a native replay.  filled, unusable: how many samples.  sink: called with the next rows.
+    observer: called with the next samples and their estimates, at the times of their arrival.
     latest: angle [rad electrical], speed [rad/s electrical], 1-sigma [rad electrical], flags of `confidence` and
     excitation [V^2 s] at the newest sample.
     Times of rows count sample periods from the first sample.
     """
 
     def __init__(self, config: DriveConfig, inverter: InverterMap, rate: float,
-                 sink: Callable[[RowBlock], None] | None = None) -> None:
+                 sink: Callable[[RowBlock], None] | None = None,
+                 observer: Callable[[Tracked], None] | None = None) -> None:
         self.summary = NodeSummary(sample_rate=rate)
         self.filled = self.unusable = self.lost = 0
         self.estimator = Estimator(config.build_motor(), rate, settings_with(config, inverter, rate))
         self.latest = (math.nan, 0.0, math.pi, 0, 0.0)
         self._max_gap = config.wire.max_gap
         self._sink = sink
+        self._observer = observer
+        self._number = config.wire.node
+        self._last = (-1, 0)
+        """Index of the newest sample, and when it arrived [ns]."""
         self._rate = rate
         self._state = np.zeros(1, _STATE)
 
@@ -118,11 +126,31 @@ class MappedTracking:
         filled = source < 0
         self.filled += int(np.count_nonzero(filled))
         self.lost += int(left[:m][left[:m] < RESTARTED].sum()) + int(np.count_nonzero(filled))
+        if self._observer is not None:
+            self._observer(self._tracked(block, samples, source, index, left[:m].copy(), e))
         self._note(block, source, index, RowBlock(
             index & 0xFFFFFFFF, filled.view(np.uint8), index / self._rate, e.angle[speed.THETA_HAT],
             e.angle[speed.OMEGA], (e.flags & confidence.VALID != 0).view(np.uint8),
             (e.flags & confidence.LOCKED != 0).view(np.uint8), np.zeros(m, np.uint8), e.excitation,
             e.flux[ges.LAMBDA_A], e.flux[ges.LAMBDA_B]))
+
+    def _tracked(self, block: MappedBlock, samples: Floats, source: Ints, index: Ints, gap: Ints,
+                 estimate: EstimateBlock) -> Tracked:
+        filled = source < 0
+        real = np.flatnonzero(~filled)
+        t_ns = np.empty(source.size, np.int64)
+        t_ns[real] = block.t_ns[source[real]]
+        if real.size < source.size:
+            # one that was filled stands evenly between the two that it joins; the first of all is never filled
+            at, then = self._last
+            base = int(block.t_ns[0])
+            known = np.concatenate([[then], t_ns[real]]) - base if at >= 0 else t_ns[real] - base
+            numbers = np.concatenate([[at], index[real]]) if at >= 0 else index[real]
+            t_ns[filled] = base + np.rint(np.interp(index[filled], numbers, known)).astype(np.int64)
+        self._last = int(index[-1]), int(t_ns[-1])
+        none = np.zeros(source.size, np.uint8)
+        run = SampleRun(self._rate, index & 0xFFFFFFFF, samples, filled.view(np.uint8), none, gap, t_ns)
+        return Tracked(self._number, run, estimate, none)
 
     def _note(self, block: MappedBlock, source: Ints, index: Ints, rows: RowBlock) -> None:
         s = self.summary
