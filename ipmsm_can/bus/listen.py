@@ -21,16 +21,17 @@ class Listener:
     """Feeds a `BusHealth` from a link.
 
     counts_drops: the port knows what the kernel dropped.  reconnect: go on when the bus comes back; else `run`
-    raises BusError.  observer: is shown every block, as those of `LiveRunner` are.
+    raises BusError.  observer: is shown every block, as those of `LiveRunner` are.  clock: monotonic [s].
     """
 
     def __init__(self, link: Link, health: BusHealth, counts_drops: bool, reconnect: bool = True,
-                 observer: Observer | None = None) -> None:
+                 observer: Observer | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self.link = link
         self.health = health
         self._counts_drops = counts_drops
         self._reconnect = reconnect
         self._observer = observer
+        self._clock = clock
         self._newest: tuple[int, float] | None = None
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -58,9 +59,16 @@ class Listener:
     def _take(self, block: FrameBlock) -> None:
         self.health.update(block)
         if len(block):
-            self._newest = int(block.t_ns[-1]), time.monotonic()
+            self._newest = int(block.t_ns[-1]), self._clock()
         if self._observer is not None:
-            self._observer(block, (), _NOTHING, 0 if self._newest is None else self._newest[0])
+            self._observer(block, (), _NOTHING, self.now_ns())
+
+    def now_ns(self) -> int:
+        """The time on the frames' axis [ns], which goes on in a silence; 0 before the first frame."""
+        if self._newest is None:
+            return 0
+        t_ns, at = self._newest
+        return t_ns + round(1e9 * (self._clock() - at))
 
     def report(self) -> HealthReport:
         """As of now; may be called from another thread."""
@@ -69,8 +77,7 @@ class Listener:
         self.health.note_outages(link.outages, link.outage_time, link.words)
         now_ns = None
         if self._newest is not None:
-            t_ns, at = self._newest
-            silent = round(1e9 * (time.monotonic() - at))
             # the adapter may stamp by a clock of its own: its newest frame is now, unless nothing comes
-            now_ns = t_ns + silent if silent > _SILENT_NS else None
+            now = self.now_ns()
+            now_ns = now if now - self._newest[0] > _SILENT_NS else None
         return self.health.report(link.port.description, now_ns)

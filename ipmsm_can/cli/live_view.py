@@ -33,6 +33,8 @@ examples:
   ipmsm-can monitor drive.toml --log run.blf --speed 2        a recording, twice as fast as it came
   ipmsm-can monitor drive.toml -i socketcan -c can0           a live bus, listening
   ipmsm-can monitor drive.toml -i socketcan -c can0 --transmit
+  ipmsm-can monitor drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm      another inverter, live
+  ipmsm-can monitor drive.toml --log run.blf --map cascadia_pm                       and as a recording
   ipmsm-can monitor left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000
 
 Press h for the keys. Where standard output is not a terminal there is one line a second, as of `run`. NO_COLOR is
@@ -52,6 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("configs", nargs="*", metavar="drive.toml", help="configuration of a drive, one file each")
     parser.add_argument("--transmit", action="store_true",
                         help="send estimates, status and injection commands; without it nothing is ever sent")
+    parser.add_argument("--map", metavar="MAP", help="the drive is another inverter: a map, or the name of one "
+                        "(docs/mapping.md, ipmsm-can map list); it is only listened to")
+    parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
     parser.add_argument("--log", metavar="LOG", help="play this recording instead of a live bus")
     parser.add_argument("--speed", type=_speed, metavar="X",
                         help="with --log: times as fast as it came (default: 1)")
@@ -79,6 +84,10 @@ def _speed(text: str) -> float:
 def main(args: argparse.Namespace) -> int:
     """Watch until told to end; returns the exit code."""
     _check(args)
+    if args.map is not None:
+        from ipmsm_can.cli.live_view_mapped import watch_mapped
+
+        return watch_mapped(args)
     from ipmsm_can.bus.link import Link
     from ipmsm_can.bus.live import LiveRunner
     from ipmsm_can.bus.warmup import warm_up_companion
@@ -131,7 +140,11 @@ def _check(args: argparse.Namespace) -> None:
         raise ValueError("--speed is given without --log; only a recording can be played at another speed")
     if args.log is not None and args.record:
         raise ValueError("--record is given with --log, which is a recording already")
-    if not args.configs and not args.demo:
+    if args.map is not None and args.demo:
+        raise ValueError("--demo does not go with --map: the simulated drive speaks our own messages")
+    if args.node is not None and args.map is None:
+        raise ValueError("--node goes with --map; without a map the drive.toml has wire.node")
+    if not args.configs and not args.demo and args.map is None:
         raise ValueError("no drive.toml is given; allowed is one for each drive (`ipmsm-can config --explain` "
                          "writes one), or --demo")
 

@@ -86,12 +86,17 @@ def build_view(args: argparse.Namespace, sight: Sight, companion: Companion | No
     return view, news
 
 
-def ends_with(view: LiveView, link: Link, stop: bus.Stop) -> Callable[[], bool]:
-    """What tells the runner to end: the user does, or the log where there is no keyboard."""
+def ends_with(view: LiveView, link: Link, stop: bus.Stop, at_end: Callable[[], None] = lambda: None
+              ) -> Callable[[], bool]:
+    """What tells the runner to end: the user does, or the log where there is no keyboard.
+
+    at_end: called once a log is over, before its last picture is taken.
+    """
 
     def ends() -> bool:
         over = getattr(link.port, "finished", False)
-        if over and view.keys:
+        if over and not view.over:
+            at_end()
             view.hold_at_end()
         return bool(stop()) or (over and not view.keys)
 

@@ -64,7 +64,8 @@ class MappedMonitor:
         follower = self._follower
         tracking = follower.tracking
         motor = follower.config.build_motor()
-        flowing = self._received > 0 and 1e9 * r.last - follower.last_ns < self._silent_ns and not r.no_bus
+        silent_ns = self._listener.now_ns() - follower.last_ns  # a bus with nothing else on it is silent, too
+        flowing = self._received > 0 and silent_ns < self._silent_ns and not r.no_bus
         self.flowing, live = flowing, flowing and tracking is not None
         theta, omega, sigma, flags, excitation = (tracking.latest if tracking is not None else
                                                   (math.nan, 0.0, math.pi, 0, 0.0))

@@ -51,8 +51,8 @@ def run_mapped(args: argparse.Namespace) -> int:
             listener.run(stop)
             follower.flush()
 
-        code, status = bus.serve("run", listen, monitor.status, args.quiet)
-    tell(follower, status.elapsed)
+        code, _ = bus.serve("run", listen, monitor.status, args.quiet)
+    tell(follower)
     if link.down:
         print(f"ipmsm-can run: there is {link.words}", file=sys.stderr)
         code = 1
@@ -107,7 +107,7 @@ def warm_up(health: object, follower: Follower) -> None:
     spare.report()
 
 
-def tell(follower: Follower, elapsed: float) -> None:
+def tell(follower: Follower) -> None:
     """What was found, after the summary."""
     for note in follower.notes:
         print(f"note: {note}")
@@ -120,4 +120,4 @@ def tell(follower: Follower, elapsed: float) -> None:
         if s.encoder.compared:
             print(f"reported angle: the estimate is {math.degrees(s.encoder.rms):.3f} deg rms off it, "
                   f"{math.degrees(s.encoder.largest):.3f} deg at most (electrical), at {s.encoder.compared} valid "
-                  f"samples of {elapsed:.1f} s")
+                  f"samples of {s.duration:.1f} s")

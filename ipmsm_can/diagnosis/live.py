@@ -14,6 +14,7 @@ from ipmsm_can.diagnosis.finding import Finding, Report
 from ipmsm_can.frames import FrameBlock
 
 if TYPE_CHECKING:
+    from ipmsm_can.analysis.pieces import MapPieces
     from ipmsm_can.config.model import DriveConfig
     from ipmsm_can.wire.protocol import Protocol
 
@@ -28,18 +29,22 @@ class LiveDiagnosis:
     """The diagnosis of one drive while it runs.
 
     config: the drive.  protocol: the wire; None builds the one of wire.dbc.  window_s: how many of the last seconds
-    count [s].  every_s: the least time between two judgements [s].  clock: monotonic [s].
+    count [s].  every_s: the least time between two judgements [s].  clock: monotonic [s].  pieces: what reads the
+    frames instead of our own wire, such as `analysis.pieces.MapPieces`; voltage_delay: by how many samples its
+    voltage is late.
 
     `feed` only keeps the block; `findings` and `report` decode and judge, in the thread of who asks, which
     therefore must not be the one that receives.
     """
 
     def __init__(self, config: DriveConfig, protocol: Protocol | None = None, *, window_s: float = WINDOW_S,
-                 every_s: float = EVERY_S, clock: Callable[[], float] = time.monotonic) -> None:
+                 every_s: float = EVERY_S, clock: Callable[[], float] = time.monotonic,
+                 pieces: MapPieces | None = None, voltage_delay: float = 0.0) -> None:
         self.left_out = 0
         """Frames that came faster than anybody asked."""
         self._config = config
-        self._builder = MeasurementBuilder(config, protocol, window_s=window_s, source="live")
+        self._builder = MeasurementBuilder(config, protocol, pieces=pieces, window_s=window_s,
+                                           voltage_delay=voltage_delay, source="live")
         self._waiting: deque[FrameBlock] = deque()
         self._frames = 0
         self._lock = threading.Lock()

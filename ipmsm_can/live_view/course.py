@@ -73,7 +73,7 @@ class CourseRing:
         self._axes = bool(in_dq[-1])
         use = np.isfinite(values[:2]).all(axis=0)
         values, t_ns = np.ascontiguousarray(values[:, use]), part.t_ns[use]
-        omega = np.where(np.isfinite(part.omega_e), part.omega_e, part.turning)[use]
+        omega = part.omega_e[use]
         # In their own frame they stand at angle 0, wherever that is: its 1-sigma is "unknown", and yet they count.
         theta = np.where(np.isfinite(omega), 0.0, np.nan)
         add_block(values, t_ns, theta, omega, np.full(t_ns.size, math.pi), math.inf, self._bins, self._newest)

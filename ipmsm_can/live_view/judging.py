@@ -20,26 +20,35 @@ from dataclasses import dataclass
 from functools import partial
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
-from ipmsm_can.frames import FrameBlock
+from ipmsm_can.frames import CAN_ERR_FLAG, FrameBlock
 from ipmsm_can.live_view.status import SEVERITIES, Told
 
 if TYPE_CHECKING:
     from ipmsm_can.config import DriveConfig
+    from ipmsm_can.diagnosis.live import LiveDiagnosis
 
 JUDGE_S = 2.0
 """Time between two judgements [s]."""
 DRIVE_S = 5.0
 """The least time between two judgements of a drive, the dearest [s]."""
 _NICE = 10
+_WAIT_NS = 2_000_000_000
+"""How long strangers alone are no finding."""
+_STRANGERS_KEPT = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is to be judged.  rates: nominal and data bit rate [bit/s].  error_classes: as in `BusHealth`."""
+    """What is to be judged.  rates: nominal and data bit rate [bit/s].  error_classes: as in `BusHealth`.
+
+    map: of the one drive, if it is another inverter: name or path, "" for our own wire; node: instead of the map's.
+    """
 
     configs: tuple[DriveConfig, ...]
     rates: tuple[int, int]
     error_classes: bool
+    map: str = ""
+    node: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +85,9 @@ class BusSource:
 
         protocol = build_protocol(plan.configs)
         warm_up(protocol)
-        self._health = BusHealth(*plan.rates, protocol=protocol, error_classes=plan.error_classes)
+        # another's messages may have our identifiers, and are no samples of ours
+        self._health = BusHealth(*plan.rates, protocol=None if plan.map else protocol,
+                                 error_classes=plan.error_classes)
 
     def feed(self, batch: Batch) -> None:
         """Take in frames."""
@@ -104,13 +115,84 @@ class DriveSource:
 
     def findings(self) -> list[Told]:
         """As of now; the cause of the rest first."""
-        return [Told(f.severity if f.severity in SEVERITIES else "notice", self._name + f.sentence, f.advice)
-                for f in self._diagnosis.findings()]
+        return _told(self._diagnosis, self._name)
+
+
+def _told(diagnosis: LiveDiagnosis, name: str = "") -> list[Told]:
+    return [Told(f.severity if f.severity in SEVERITIES else "notice", name + f.sentence, f.advice)
+            for f in diagnosis.findings()]
+
+
+class MappedSource:
+    """Another inverter through its map: what is missing or doubtful of its signals, and, where they allow the fast
+    observer, the diagnosis of the drive."""
+
+    def __init__(self, plan: Plan) -> None:
+        from ipmsm_can.mapping import load_map, make_plan
+        from ipmsm_can.mapping.look import Look
+
+        self._config = plan.configs[0]
+        pole_pairs = self._config.build_motor().pole_pairs
+        self._look = Look(make_plan(load_map(plan.map), node=plan.node, pole_pairs=pole_pairs),
+                          self._config.wire.sample_rate)
+        self._diagnosis: LiveDiagnosis | None = None
+        self._seen: set[int] = set()
+        """Identifiers, while none of the map has come."""
+        self._first_ns = self._last_ns = 0
+
+    def feed(self, batch: Batch) -> None:
+        """Take in frames."""
+        if self._look.nothing_came and len(batch.block):
+            self._note_strangers(batch.block)
+        decided = self._look.allowed is not None
+        block = batch.block if decided else self._look.feed(batch.block)
+        allowed = self._look.allowed
+        if block is None or allowed is None or not allowed.fast:
+            return
+        if self._diagnosis is None:
+            self._diagnosis = self._begin(allowed.rate)
+        self._diagnosis.feed(block)
+
+    def _note_strangers(self, block: FrameBlock) -> None:
+        self._first_ns = self._first_ns or int(block.t_ns[0])
+        self._last_ns = int(block.t_ns[-1])
+        if len(self._seen) < _STRANGERS_KEPT:
+            self._seen |= set(block.can_id[block.can_id & CAN_ERR_FLAG == 0].tolist())
+
+    def _begin(self, rate: float) -> LiveDiagnosis:
+        from ipmsm_can.analysis.pieces import MapPieces
+        from ipmsm_can.diagnosis.live import LiveDiagnosis
+
+        voltage = self._look.plan.map.voltage
+        return LiveDiagnosis(self._config, every_s=DRIVE_S, pieces=MapPieces(self._look.plan, rate),
+                             voltage_delay=0.0 if voltage is None else voltage.delay)
+
+    def findings(self) -> list[Told]:
+        """As of now: why there is no angle, what is wrong with the signals, what with the drive."""
+        from ipmsm_can.mapping.check import no_frame
+
+        look, diagnosis = self._look, self._diagnosis
+        found = [] if diagnosis is None else _told(diagnosis)
+        if look.nothing_came and self._seen and self._last_ns - self._first_ns > _WAIT_NS:
+            found.append(Told("warning", _sentence(no_frame(look.plan, sorted(self._seen), "the bus")),
+                              "Is it the right map, and --node the right number?"))
+        elif look.allowed is None and look.notes:
+            found.append(Told("warning", _sentence(look.verdict)))
+        elif look.allowed is not None and not look.allowed.fast:
+            found.append(Told("notice", _sentence(look.verdict), "docs/mapping.md says what each function needs."))
+        return found + [Told("notice", f"Of the map: {note}.", "`ipmsm-can map --check` tells more, from a log.")
+                        for note in look.notes]
+
+
+def _sentence(words: str) -> str:
+    return f"{words[:1].upper()}{words[1:]}."
 
 
 def build_sources(plan: Plan) -> dict[str, Source]:
     """What is looked at, by its name in words."""
     sources: dict[str, Source] = {"the bus": BusSource(plan)}
+    if plan.map:
+        return {**sources, f"drive {plan.configs[0].wire.node} through its map": MappedSource(plan)}
     for config in plan.configs:
         number, several = config.wire.node, len(plan.configs) > 1
         sources[f"drive {number}"] = DriveSource(config, f"drive {number}: " if several else "")

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from ipmsm_can.cli import plain
 from ipmsm_can.live_view import chart
-from ipmsm_can.live_view.status import FINDINGS, HELP, Course, DriveView, MonitorStatus, Told
+from ipmsm_can.live_view.status import FINDINGS, HELP, DriveView, MonitorStatus, Told
 
 _GOOD, _WARN, _BAD, _DIM = "cyan", "yellow", "bold reverse", "dim"
 _STYLES = {"error": _BAD, "warning": "bold yellow", "notice": "cyan"}
@@ -122,15 +122,19 @@ def _main(status: MonitorStatus, width: int, room: int) -> list[Text]:
     table = _table(status, width, room - len(numbers) - len(bus) - 2) if len(status.drives) > 1 else []
     # Findings and events first, then the curves; what is still left parts the sections.
     left = room - len(table) - len(numbers) - len(bus)
+    figures = [_labelled(name, words) for name, words in drive.figures]
     told = _findings(status, width, 2 if left < 12 else left // 3)
     events = _events(status, 1 if left < 12 else left // 5)
     left -= len(told) + len(events)
+    # what is left beside the lowest curves, or all there is
+    figures = figures[:max(left - _CHART_LEAST - 1 if left > _CHART_LEAST else left, 0)]
+    left -= len(figures)
     curves = []
     if left > _CHART_LEAST:
-        curves = _charts(drive.course, width, min(_CHART_MOST, left - 1), status.ascii)
+        curves = _charts(drive, width, min(_CHART_MOST, left - 1), status.ascii)
         left -= len(curves)
     lines: list[Text] = []
-    for section in (table, numbers, curves, bus, told, events):
+    for section in (table, numbers + figures, curves, bus, told, events):
         if lines and section and left > 0:
             lines.append(Text())
             left -= 1
@@ -154,8 +158,9 @@ def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
                          (node.state, _GOOD if node.locked else _WARN))
     flags = Text("  ".join(f"[{'x' if on else ' '}] {name}" for name, on in (
         ("valid", node.valid), ("locked", node.locked), ("polarity", node.polarity_known))))
-    head.append(" " * max(2, width - head.cell_len - flags.cell_len))
-    head.append(flags)
+    if any((node.valid, node.locked, node.polarity_known)) or head.cell_len + 2 + flags.cell_len <= width:
+        head.append(" " * max(2, width - head.cell_len - flags.cell_len))
+        head.append(flags)
     trust = (node.trust, "bold cyan" if node.valid else "bold yellow" if node.live else _BAD)
     if node.known:
         sigma = _fine(math.degrees(node.sigma))
@@ -166,23 +171,28 @@ def _drive(drive: DriveView, width: int, ascii_only: bool) -> list[Text]:
         sure = f" {pm} {_fine(drive.rpm_sigma)}" if math.isfinite(drive.rpm_sigma) and node.known else ""
         speed = f"{drive.rpm:+7.1f}{sure} rpm mechanical"
         speed = f"{speed:34}{node.omega:+.1f} rad/s electrical"
+    elif drive.reported and math.isfinite(drive.rpm):
+        speed = f"{f'{drive.rpm:+7.1f} rpm mechanical':34}as the drive reports it"
     else:
         speed = "unknown"
     # Whether it may be used must not be cut off.
     shown = (trust, f"  {angle}") if width < _NARROW else (f"{angle:34}", trust)
     lines = [head, _labelled("angle", *shown), _labelled("speed", speed)]
-    if node.live and math.isfinite(drive.i_rms):
-        axes = (f"i_d {drive.i_d:+.2f}  i_q {drive.i_q:+.2f} A peak" if math.isfinite(drive.i_d) and node.known
-                else "i_d, i_q unknown")
+    if (node.live or drive.reported) and math.isfinite(drive.i_rms):
+        axes = (f"i_d {drive.i_d:+.2f}  i_q {drive.i_q:+.2f} A peak"
+                if math.isfinite(drive.i_d) and (node.known or drive.reported) else "i_d, i_q unknown")
         of = f"{100.0 * drive.i_rms / drive.rated:.0f} % of rated current" if drive.rated > 0.0 else ""
         current = f"{drive.i_rms:.2f} A rms, {drive.i_peak:.2f} A peak"
         lines.append(_labelled("current", f"{current:34}{axes}"))
-        lines.append(_labelled("voltage", f"{f'{drive.v_rms:.1f} V rms to neutral':34}{of}"))
+        voltage = f"{drive.v_rms:.1f} V rms to neutral" if math.isfinite(drive.v_rms) else "unknown"
+        lines.append(_labelled("voltage", f"{voltage:34}{of}"))
     else:
         lines.append(_labelled("current", "unknown"))
     lines.append(_probing(drive))
-    lines.append(_labelled("samples", f"{node.samples_per_s:.0f}/s of {node.sample_rate:.0f} Hz   "
-                           f"excitation {node.excitation:.3g} V^2 s"))
+    rate = f"{node.samples_per_s:.0f}/s of {node.sample_rate:.0f} Hz" if node.sample_rate else (
+        f"{node.samples_per_s:.0f}/s")
+    excitation = "" if drive.reported else f"   excitation {node.excitation:.3g} V^2 s"
+    lines.append(_labelled("samples", rate + excitation))
     always = {"lost", "gaps", "bad frames"}
     lines += _listed("losses", [(name, n) for name, n in plain.losses(node) if n or name in always], width)
     if node.encoder:
@@ -239,11 +249,13 @@ def _table(status: MonitorStatus, width: int, room: int) -> list[Text]:
     return lines
 
 
-def _charts(course: Course, width: int, rows: int, ascii_only: bool) -> list[Text]:
-    """Title and curves, side by side: speed, sigma, and where there is room the current."""
-    curves = [("speed [rpm mech.]", course.speed_low, course.speed_high, 10.0, False),
-              ("1 sigma of the angle [deg el.]", course.sigma, course.sigma, 1.0, True)]
-    if width >= _WIDE:
+def _charts(drive: DriveView, width: int, rows: int, ascii_only: bool) -> list[Text]:
+    """Title and curves, side by side: speed, sigma, and where there is room, or no sigma, the current."""
+    course = drive.course
+    curves = [("speed [rpm mech.]", course.speed_low, course.speed_high, 10.0, False)]
+    if not drive.reported:
+        curves.append(("1 sigma of the angle [deg el.]", course.sigma, course.sigma, 1.0, True))
+    if drive.reported or width >= _WIDE:
         curves.append(("phase current [A rms]", course.current, course.current, 0.1, True))
     each = width // len(curves) - 1
     seconds = chart.points(each, ascii_only) * course.column_s

@@ -51,6 +51,11 @@ class Look:
         self._count = 0
         self._from_ns: int | None = None
 
+    @property
+    def nothing_came(self) -> bool:
+        """No frame of the map did."""
+        return self.verdict == _NOTHING_CAME
+
     def feed(self, block: FrameBlock) -> FrameBlock | None:
         """Take in frames; once it is decided, all of them from the beginning of the look on, else None."""
         while len(block):
@@ -78,7 +83,7 @@ class Look:
         if not ours.size and self.plan.map.map.identifiers != "either length":
             return False
         self._from_ns = int(block.t_ns[ours[0] if ours.size else 0])
-        if self.verdict == _NOTHING_CAME:
+        if self.nothing_came:
             self.verdict = "looking at the signals"
         return True
 
