@@ -30,10 +30,12 @@ from ipmsm_can.logs.writer import write_log
 from ipmsm_can.mapping import load_map, make_plan
 from ipmsm_can.mapping import look as looking
 from ipmsm_can.mapping.follow import Follower
+from ipmsm_can.mapping.load import map_folder
 from ipmsm_can.mapping.look import Look
 from ipmsm_can.mapping.mapper import Mapper
 from ipmsm_can.node import Tracked
 from ipmsm_can.wire.protocol import Protocol
+from tests import mapping_traffic
 from tests.replaying import drive_frames
 from tests.test_mapping_drives import PAIRS, cascadia
 from tests.test_mapping_live import run_live
@@ -71,10 +73,11 @@ class Fed:
 class Stage:
     """A mapped drive and the live view, in a time of their own."""
 
-    def __init__(self, name: str, frames: FrameBlock, piece: int = 500, look_s: float = 0.3) -> None:
+    def __init__(self, name: str, frames: FrameBlock, piece: int = 500, look_s: float = 0.3,
+                 node: int | None = None) -> None:
         self.passed = 0.0
         self.port = Fed(frames, piece)
-        plan = make_plan(load_map(name), pole_pairs=CONFIG.build_motor().pole_pairs)
+        plan = make_plan(load_map(name), node=node, pole_pairs=CONFIG.build_motor().pole_pairs)
         self.sight = MappedSight(CONFIG, plan, look_s)
         self.clock = FrameClock(True, lambda: 0.0)
         self.controls = Controls(None, None, lambda: None, self.clock.now_ns, self.clock.words, threading.Event(),
@@ -184,6 +187,27 @@ def test_while_it_looks_there_is_what_the_drive_reports() -> None:
     assert status.run.nodes[0].state == "looking at the signals"
     assert status.drives[0].reported and status.run.nodes[0].received > 30
     assert status.drives[0].rpm == pytest.approx(240.0, rel=1e-3) and not claims_an_angle(text(status))
+
+
+def vesc(seconds: float) -> FrameBlock:
+    """Speed and current, and no voltage at all."""
+    t = np.arange(round(50 * seconds)) * 2e-2
+    return mapping_traffic.frames(map_folder() / "vesc.dbc", {
+        "VESC_Status": (t, {"erpm": 720.0, "current": 6.0, "duty": 0.1})}, 57)
+
+
+def test_a_map_without_a_voltage_shows_what_is_reported(config: Path, tmp_path: Path,
+                                                        capsys: pytest.CaptureFixture[str]) -> None:
+    stage = Stage("vesc", vesc(3.0), 10, node=57)
+    status = stage.go()
+    assert status.run.nodes[0].state == "nothing can be made of the signals" and not status.run.nodes[0].live
+    assert (status.drives[0].rpm, status.drives[0].i_q) == pytest.approx((240.0, 6.0), rel=1e-3)
+    shown = text(status)
+    assert "voltage     unknown" in shown and "as the drive reports it" in shown and not claims_an_angle(shown)
+    log = tmp_path / "run.blf"
+    write_log(log, [vesc(3.0)])
+    assert monitor(config, "--log", str(log), "--map", "vesc", "--node", "57", "--speed", "20") == 0
+    assert "nothing can be made of the signals: the map has not the voltage" in capsys.readouterr().out
 
 
 def test_the_wrong_bus(fast: FrameBlock) -> None:
