@@ -472,5 +472,6 @@ def test_the_bus_going_away_is_not_hidden_by_a_pause(monkeypatch: pytest.MonkeyP
     stage = Stage(transmit=False)
     stage.go(0.1)
     stage.press("p")
+    assert isinstance(stage.view.sight, WireSight)
     monkeypatch.setattr(stage.view.sight.monitor, "_no_bus", lambda: "no bus since 14:00:00: can0 is down")
     assert stage.view.status().run.bus.no_bus == "no bus since 14:00:00: can0 is down"
