@@ -15,7 +15,7 @@ from ipmsm_can.config.build import estimator_settings, injection_settings, probi
 from ipmsm_can.drive.profile import RPM, Profile
 from ipmsm_can.estimation import confidence
 from ipmsm_can.injection.by_sigma import AGAIN, FALL_TIME, OUT_OF_REACH, RISE_TIME, SigmaRule
-from ipmsm_can.injection.scheduler import InjectionScheduler
+from ipmsm_can.injection.scheduler import Command, InjectionScheduler
 from ipmsm_can.motor import M2, PRESETS
 from ipmsm_can.wire.protocol import Waveform
 from tools import probing
@@ -236,6 +236,18 @@ def test_a_moment_without_valid_does_not_change_the_waveform() -> None:
     assert ask(False, round(0.14 / PERIOD)) is Waveform.ROTATING
     assert ask(True, 3) is Waveform.ROTATING, "rotating showed the axis no worse: there it stays"
     assert ask(True, 3, 0.05) is Waveform.PULSATING
+
+
+def test_pulses_that_showed_the_pole_are_followed_by_probing_along_d() -> None:
+    """What they have shown is known, though it is not valid for some milliseconds yet; what they have not is not."""
+    pulses = Command(Waveform.POLARITY_PULSES, 20.0, 400.0, 0.3, 0.1)
+    for sigma, then in ((0.05, Waveform.PULSATING), (math.pi, Waveform.ROTATING)):
+        scheduler = InjectionScheduler(injection_settings(settings(), 5000.0), transmit=True)
+        for _ in range(3):
+            scheduler.update(PERIOD, 0.0, 0.0, 0.3, 0.0, True, pulses=pulses)
+        for _ in range(3):  # the amplitude is kept from before the pulses, and may have to come back
+            command = scheduler.update(PERIOD, 0.0, 0.0, 0.3, 0.0, True, sigma=sigma)
+        assert command is not None and command.waveform is then
 
 
 def test_the_amplitude_settles_where_sigma_meets_the_target() -> None:

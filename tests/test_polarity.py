@@ -224,6 +224,14 @@ def test_random_starts(case: standstill.Case) -> None:
     assert good, line
 
 
+@pytest.mark.parametrize("seed", [18, 83, 98])
+def test_after_the_pulses_probing_begins_once(seed: int) -> None:
+    """It began rotating, until 5 ms later the angle was valid, and anew along d: meanwhile sigma grew too large."""
+    results = standstill.runs(replace(standstill.CASES[0], observer="riccati"), [seed])
+    line, good = standstill.judge(standstill.CASES[0], results)
+    assert good, line
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("case", [standstill.CASES[k] for k in (0, 2, 4)], ids=lambda c: c.name)
 def test_dead_time_is_not_taken_for_polarity(case: standstill.Case, seed: int) -> None:

@@ -172,7 +172,10 @@ class InjectionScheduler:
             if self._along and (sigma > ASTRAY or self._unsure > _PATIENCE):
                 # Rotating shows the axis somewhat better; back only where there is room, or it would go to and fro.
                 self._along, self._along_below = False, _ROOM * min(sigma, ASTRAY)
-            self._along = s.along_d and not asked and (self._along or (valid and sigma < self._along_below))
+            # What pulses have just shown is known, though it takes a moment until it is valid: another waveform in
+            # between would begin from nothing, twice.
+            sure = (valid or self._settling > 0.0) and sigma < self._along_below
+            self._along = s.along_d and not asked and (self._along or sure)
             waveform = Waveform.PULSATING if self._along else s.waveform
             return Command(waveform, self.amplitude, s.frequency, axis, s.time_to_live)
         if self._off_left > 0:
