@@ -239,7 +239,7 @@ def test_a_moment_without_valid_does_not_change_the_waveform() -> None:
 
 
 def test_pulses_that_showed_the_pole_are_followed_by_probing_along_d() -> None:
-    """What they have shown is known, though it is not valid for some milliseconds yet; what they have not is not."""
+    """What they have shown is known, though not valid for some milliseconds yet; what they have not is not."""
     pulses = Command(Waveform.POLARITY_PULSES, 20.0, 400.0, 0.3, 0.1)
     for sigma, then in ((0.05, Waveform.PULSATING), (math.pi, Waveform.ROTATING)):
         scheduler = InjectionScheduler(injection_settings(settings(), 5000.0), transmit=True)

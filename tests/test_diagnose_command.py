@@ -19,6 +19,8 @@ from ipmsm_can.drive.simulation import DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs.writer import write_log
 from ipmsm_can.wire.protocol import Protocol
+from tests.test_mapping_drives import cascadia
+from tests.test_mapping_live import run_live
 from tools.faults import FAULTS, Drive, config, frames, healthy, ordinary_profile
 
 PROTOCOL = Protocol()
@@ -165,7 +167,9 @@ def test_bad_maps_and_options_give_one_sentence_and_2(tmp_path: Path, late: Fram
     assert "input files" in refused(capsys, str(log), "--drive", given, "--json", given)
     assert "neither a LOG was named nor a bus" in refused(capsys, "--drive", given)
     assert "both the log" in refused(capsys, str(log), "--drive", given, "-i", "virtual", "-c", "0")
-    assert "go with a LOG" in refused(capsys, "--drive", given, "-i", "virtual", "-c", "0", "--map", "vesc")
+    live = ("--drive", given, "-i", "virtual", "-c", "0")
+    assert "--node goes with --map" in refused(capsys, *live, "--node", "3")
+    assert "shipped are" in refused(capsys, *live, "--map", "no_such_map")
 
 
 def test_a_silent_bus_gives_one_sentence_and_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -197,3 +201,30 @@ def test_live_it_listens_to_the_bus_and_sends_nothing(tmp_path: Path, capsys: py
         while len(block := witness.receive(0.1)):
             heard += len(block)
         assert heard == runner.sent, "somebody else sent"
+
+
+def test_live_through_a_map_it_finds_what_it_finds_in_a_log_and_sends_nothing(
+        tmp_path: Path, late: FrameBlock, capsys: pytest.CaptureFixture[str]) -> None:
+    given, log = Path(toml(tmp_path, drive(None))), tmp_path / "run.log"
+    write_log(log, [late])
+    assert main(["diagnose", str(log), "--drive", str(given), "--map", "ipmsm_can"]) == 1
+    recorded = capsys.readouterr().out.splitlines()
+    code, said, heard = run_live(given, "ipmsm_can", late, capsys, command="diagnose")
+    assert code == 1 and not heard
+    begin = next(k for k, line in enumerate(recorded) if line.startswith("length"))
+    source, *report = said.splitlines()
+    assert source == "ipmsm_can (virtual through python-can) with the map ipmsm_can"
+    figure = re.compile(r"[\d.]+")  # python-can's time stamps are floats: the last digit of a figure may differ
+    assert [figure.sub("#", line) for line in report] == [figure.sub("#", line) for line in recorded[begin:]]
+    assert report[0] == recorded[begin]
+    assert "WARNING: the voltage is late" in report
+
+
+def test_live_through_a_map_it_says_why_nothing_can_be_said(tmp_path: Path, late: FrameBlock,
+                                                            capsys: pytest.CaptureFixture[str]) -> None:
+    given = Path(toml(tmp_path, drive(None)))
+    for block, why in ((late.take(slice(0, 20)), "holds no frame of the map (identifiers 0x0A5"),
+                       (cascadia(seconds=0.5), "does not hold the samples that this takes: "),
+                       (late.take(slice(0, 0)), "no frame came on cascadia_pm")):
+        code, said, _ = run_live(given, "cascadia_pm", block, capsys, command="diagnose")
+        assert code == 2 and why in said and "Traceback" not in said, said

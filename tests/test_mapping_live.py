@@ -89,6 +89,7 @@ def test_it_looks_until_there_is_something_and_again_where_that_was_not_enough(c
 def run_live(config: Path, name: str, frames: FrameBlock, capsys: pytest.CaptureFixture[str],
              *options: str, command: str = "run", quiet: str = "--quiet") -> tuple[int, str, list[int]]:
     """The command on a virtual bus with this traffic; exit code, what it said, identifiers it sent."""
+    begin = [command, "--drive", str(config)] if command == "diagnose" else [command, str(config), quiet]
     stops: list[bus.Stop] = []
     ordinary = bus.stop_on_signals
     codes: list[int] = []
@@ -108,7 +109,7 @@ def run_live(config: Path, name: str, frames: FrameBlock, capsys: pytest.Capture
           pytest.MonkeyPatch.context() as patch):
         patch.setattr(bus, "stop_on_signals", Entered)
         thread = threading.Thread(target=lambda: codes.append(main(
-            [command, str(config), "-i", "virtual", "-c", name, "--map", name, quiet, *options])))
+            [*begin, "-i", "virtual", "-c", name, "--map", name, *options])))
         thread.start()
         deadline = time.monotonic() + 240
         while not stops and time.monotonic() < deadline:

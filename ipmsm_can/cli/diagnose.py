@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from ipmsm_can.config import DriveConfig
     from ipmsm_can.diagnosis import Report
     from ipmsm_can.diagnosis.live import LiveDiagnosis
+    from ipmsm_can.diagnosis.live_mapped import MappedDiagnosis
+    from ipmsm_can.frames import FrameBlock
 
 HELP = """\
 What is wrong with a drive: signs and phase order, current sensors, voltage, encoder, motor, excitation, position
@@ -31,6 +33,7 @@ examples:
   ipmsm-can diagnose run.blf --drive drive.toml --out diagnosis.html    a page, and diagnosis.json beside it
   ipmsm-can diagnose car.blf --drive drive.toml --map cascadia_pm       another inverter, through its map
   ipmsm-can diagnose --drive drive.toml -i socketcan -c can0 --duration 10
+  ipmsm-can diagnose --drive drive.toml -i socketcan -c can0 --duration 10 --map cascadia_pm
 
 With LOG, -c names a channel of the log. The more the drive does meanwhile (both directions, several speeds and
 loads), the more can be told; what cannot is said. docs/diagnose.md explains each finding.
@@ -49,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.add_argument("log", nargs="?", metavar="LOG", help="a recording, of any format that replay takes")
     parser.add_argument("--drive", required=True, metavar="drive.toml", help="configuration of the drive")
-    parser.add_argument("--map", metavar="MAP", help="the log is of another inverter: a map, or the name of one")
+    parser.add_argument("--map", metavar="MAP", help="another inverter: its map, or the name of a shipped one")
     parser.add_argument("--node", type=int, metavar="N", help="with --map: number of the drive, if not the map's")
     parser.add_argument("--last", type=bus.seconds, metavar="S",
                         help=f"only the last so many seconds (default: {LAST_S:g} of a log, {_LIVE_S:g} live)")
@@ -63,8 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Diagnose; returns the exit code."""
     if args.log is None:
-        if args.map is not None or args.node is not None:
-            raise ValueError("--map and --node go with a LOG; live, record first (any format) and diagnose the log")
+        if args.node is not None and args.map is None:
+            raise ValueError("--node goes with --map; without a map the drive.toml has wire.node")
         try:
             bus.check_named(args)
         except ValueError as error:
@@ -133,28 +136,58 @@ def _check_length(measurement: Measurement, args: argparse.Namespace) -> None:
 def _live(args: argparse.Namespace, config: DriveConfig) -> tuple[Report, str]:
     from ipmsm_can.bus.link import Link
     from ipmsm_can.bus.port import BusError
-    from ipmsm_can.config.build import build_protocol
-    from ipmsm_can.diagnosis.live import LiveDiagnosis
 
-    live = LiveDiagnosis(config, build_protocol([config]), window_s=args.last or _LIVE_S)
+    live, at_end = _mapped_sink(args, config) if args.map is not None else _sink(args, config)
     gone = ""
     with (bus.stop_on_signals(args.duration) as stop, bus.open_bus(args) as port,
           Link(port, lambda: bus.open_bus(args)) as link):
         name = port.description
         try:
-            _listen(link, live, stop, not args.no_reconnect)
+            _listen(link, live.feed, stop, not args.no_reconnect)
         except BusError as error:
             gone = f"the bus went away: {error}"
     _clear()
-    if not live.samples:
-        node = config.wire.node
-        raise ValueError(f"no sample of drive {node} came on {name}; `ipmsm-can bus` shows what is on the bus"
-                         + (f" ({gone})" if gone else ""))
     with bus.patience():
-        return live.report(name), gone
+        try:
+            return at_end(name), gone
+        except ValueError as error:
+            raise ValueError(f"{error} ({gone})" if gone else str(error)) from None
 
 
-def _listen(link: Link, live: LiveDiagnosis, stop: Callable[[], bool], reconnect: bool) -> None:
+def _sink(args: argparse.Namespace, config: DriveConfig) -> tuple[LiveDiagnosis, Callable[[str], Report]]:
+    """Takes in the frames of our own wire, and what makes a report of them."""
+    from ipmsm_can.config.build import build_protocol
+    from ipmsm_can.diagnosis.live import LiveDiagnosis
+
+    live = LiveDiagnosis(config, build_protocol([config]), window_s=args.last or _LIVE_S)
+
+    def report(name: str) -> Report:
+        if not live.samples:
+            raise ValueError(f"no sample of drive {config.wire.node} came on {name}; `ipmsm-can bus` shows what is "
+                             "on the bus")
+        return live.report(name)
+
+    return live, report
+
+
+def _mapped_sink(args: argparse.Namespace, config: DriveConfig) -> tuple[MappedDiagnosis, Callable[[str], Report]]:
+    """The same of another inverter."""
+    from ipmsm_can.diagnosis.live_mapped import MappedDiagnosis
+    from ipmsm_can.mapping import load_map, make_plan
+
+    plan = make_plan(load_map(args.map), node=args.node, pole_pairs=config.build_motor().pole_pairs)
+    live = MappedDiagnosis(config, plan, window_s=args.last or _LIVE_S)
+
+    def report(name: str) -> Report:
+        live.finish()
+        if live.diagnosis is None:
+            raise ValueError(live.why_none(name))
+        return live.diagnosis.report(f"{name} with the map {args.map}")
+
+    return live, report
+
+
+def _listen(link: Link, feed: Callable[[FrameBlock], None], stop: Callable[[], bool], reconnect: bool) -> None:
     from ipmsm_can.bus.port import BusError
 
     begin, shown = time.monotonic(), 0.0
@@ -164,16 +197,16 @@ def _listen(link: Link, live: LiveDiagnosis, stop: Callable[[], bool], reconnect
         try:
             block = link.port.receive(_WAIT_S)
         except BusError as error:
-            live.feed(link.lose(error))
+            feed(link.lose(error))
             if not reconnect:
                 raise
             while not stop():
                 link.pause()
-                live.feed(link.take())
+                feed(link.take())
                 if link.retry():
                     break
             continue
-        live.feed(block)
+        feed(block)
         frames += len(block)
         now = time.monotonic()
         if terminal and now - shown > _SHOW_S:

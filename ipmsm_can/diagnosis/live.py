@@ -85,6 +85,12 @@ class LiveDiagnosis:
             self._builder.source = source
             return diagnose(self._builder.measurement(), self._config)
 
+    def finish(self) -> None:
+        """Nothing more comes: samples count that wait for later reports."""
+        with self._judging:
+            self._take()
+            self._builder.finish()
+
     @property
     def samples(self) -> int:
         """Samples that are held."""

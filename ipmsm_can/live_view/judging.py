@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
-from ipmsm_can.frames import CAN_ERR_FLAG, FrameBlock
+from ipmsm_can.frames import FrameBlock
 from ipmsm_can.live_view.status import SEVERITIES, Told
 
 if TYPE_CHECKING:
@@ -32,9 +32,8 @@ JUDGE_S = 2.0
 DRIVE_S = 5.0
 """The least time between two judgements of a drive, the dearest [s]."""
 _NICE = 10
-_WAIT_NS = 2_000_000_000
+_WAIT_S = 2.0
 """How long strangers alone are no finding."""
-_STRANGERS_KEPT = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,53 +127,24 @@ class MappedSource:
     observer, the diagnosis of the drive."""
 
     def __init__(self, plan: Plan) -> None:
+        from ipmsm_can.diagnosis.live_mapped import MappedDiagnosis
         from ipmsm_can.mapping import load_map, make_plan
-        from ipmsm_can.mapping.look import Look
 
-        self._config = plan.configs[0]
-        pole_pairs = self._config.build_motor().pole_pairs
-        self._look = Look(make_plan(load_map(plan.map), node=plan.node, pole_pairs=pole_pairs),
-                          self._config.wire.sample_rate)
-        self._diagnosis: LiveDiagnosis | None = None
-        self._seen: set[int] = set()
-        """Identifiers, while none of the map has come."""
-        self._first_ns = self._last_ns = 0
+        config = plan.configs[0]
+        pole_pairs = config.build_motor().pole_pairs
+        self._drive = MappedDiagnosis(config, make_plan(load_map(plan.map), node=plan.node, pole_pairs=pole_pairs),
+                                      every_s=DRIVE_S)
 
     def feed(self, batch: Batch) -> None:
         """Take in frames."""
-        if self._look.nothing_came and len(batch.block):
-            self._note_strangers(batch.block)
-        decided = self._look.allowed is not None
-        block = batch.block if decided else self._look.feed(batch.block)
-        allowed = self._look.allowed
-        if block is None or allowed is None or not allowed.fast:
-            return
-        if self._diagnosis is None:
-            self._diagnosis = self._begin(allowed.rate)
-        self._diagnosis.feed(block)
-
-    def _note_strangers(self, block: FrameBlock) -> None:
-        self._first_ns = self._first_ns or int(block.t_ns[0])
-        self._last_ns = int(block.t_ns[-1])
-        if len(self._seen) < _STRANGERS_KEPT:
-            self._seen |= set(block.can_id[block.can_id & CAN_ERR_FLAG == 0].tolist())
-
-    def _begin(self, rate: float) -> LiveDiagnosis:
-        from ipmsm_can.analysis.pieces import MapPieces
-        from ipmsm_can.diagnosis.live import LiveDiagnosis
-
-        voltage = self._look.plan.map.voltage
-        return LiveDiagnosis(self._config, every_s=DRIVE_S, pieces=MapPieces(self._look.plan, rate),
-                             voltage_delay=0.0 if voltage is None else voltage.delay)
+        self._drive.feed(batch.block)
 
     def findings(self) -> list[Told]:
         """As of now: why there is no angle, what is wrong with the signals, what with the drive."""
-        from ipmsm_can.mapping.check import no_frame
-
-        look, diagnosis = self._look, self._diagnosis
+        look, diagnosis = self._drive.look, self._drive.diagnosis
         found = [] if diagnosis is None else _told(diagnosis)
-        if look.nothing_came and self._seen and self._last_ns - self._first_ns > _WAIT_NS:
-            found.append(Told("warning", _sentence(no_frame(look.plan, sorted(self._seen), "the bus")),
+        if look.nothing_came and self._drive.silent_s > _WAIT_S:
+            found.append(Told("warning", _sentence(self._drive.why_none("the bus")),
                               "Is it the right map, and --node the right number?"))
         elif look.allowed is None and look.notes:
             found.append(Told("warning", _sentence(look.verdict)))
