@@ -13,7 +13,7 @@ from ipmsm_can.analysis.measurement import Measurement, MeasurementBuilder
 from ipmsm_can.config import config_from
 from ipmsm_can.drive.node import DriveNode, DriveNodeSettings
 from ipmsm_can.drive.profile import Profile, constant
-from ipmsm_can.drive.simulation import DriveSimulation
+from ipmsm_can.drive.simulation import DriveParameters, DriveSimulation
 from ipmsm_can.identification import encoder_fit as fit
 from ipmsm_can.identification import identify, sensorless_fit
 from ipmsm_can.identification.samples import Stretch, encoder_angle, stretches
@@ -198,3 +198,24 @@ def test_words_and_dictionary() -> None:
     text = as_dict(found)
     assert text["parameters"]["R"]["value"] == found.value("R") and text["parameters"]["R"]["told"] is True
     assert any(s.startswith("R is ") for s in sentences(found))
+
+
+@pytest.mark.parametrize("volts", [0.0, 100.0, 300.0])
+@pytest.mark.parametrize("encoder", [True, False])
+def test_samples_that_are_not_where_they_say_never_raise(volts: float, encoder: bool) -> None:
+    """A slow rate, wraps of a short counter that never were, and a voltage that is noise: the search leaves where
+    anything can be computed."""
+    simulation = DriveSimulation(PRESETS["m2"], DriveParameters(sample_rate=1000.0, current_bandwidth=60.0),
+                                 Profile(((0.0, 20.0), (4.0, -20.0)), ((0.0, 2.0), (2.0, -2.0)), duration=4.0))
+    builder = MeasurementBuilder(config_from({"motor": {"preset": "m2"}}), protocol())
+    node = DriveNode(protocol(), 0, simulation, DriveNodeSettings(reference_rate=200.0))
+    builder.feed(node.step(4000).frames)
+    m = builder.measurement()
+    rng = np.random.default_rng(1)
+    jump = np.cumsum(np.where(rng.random(len(m)) < 0.01, 16, 0))
+    late = jump[np.searchsorted(m.sample, m.encoder_sample)]
+    none = slice(None) if encoder else slice(0)
+    found = identify(replace(m, sample=m.sample + jump, v_alpha=rng.normal(0.0, volts, len(m)),
+                             encoder_sample=(m.encoder_sample + late)[none], encoder_theta=m.encoder_theta[none],
+                             encoder_omega=m.encoder_omega[none]), PRESETS["m2"])
+    assert not found.fits and not found.told and found.notes

@@ -21,7 +21,7 @@ from ipmsm_can.identification import sensorless_fit as free
 from ipmsm_can.identification.result import MOTOR_PARAMETERS, Identification, Parameter
 from ipmsm_can.identification.samples import Stretch, encoder_angle, stretches
 from ipmsm_can.identification.saturation import bend
-from ipmsm_can.identification.solve import Solution, judge, memory, minimise, partial
+from ipmsm_can.identification.solve import Solution, Unsolvable, judge, memory, minimise, partial
 from ipmsm_can.motor import Motor
 
 Floats = NDArray[np.float64]
@@ -40,6 +40,7 @@ _NOISE = 0.02
 _CLEAR_EMF = 2.0
 """Back-EMF [V] from which on the observer's angle is trusted."""
 _MOST_WINDOWS = 60
+_NO_END = "nothing can be told: the search for the parameters did not come to an end"
 
 
 def identify(m: Measurement, motor: Motor) -> Identification:
@@ -50,9 +51,11 @@ def identify(m: Measurement, motor: Motor) -> Identification:
     are: where they tell nothing, `Identification.notes` says why.
     """
     pieces = _limited(stretches(m, encoder_angle(m)), m.sample_rate)
-    if sum(map(len, pieces)) >= LEAST_S * m.sample_rate:
-        return _with_encoder(pieces, m.sample_rate, motor)
-    return _sensorless(m, motor)
+    encoder = sum(map(len, pieces)) >= LEAST_S * m.sample_rate
+    try:
+        return _with_encoder(pieces, m.sample_rate, motor) if encoder else _sensorless(m, motor)
+    except Unsolvable:
+        return _nothing("encoder" if encoder else "sensorless", motor, _NO_END)
 
 
 def _nothing(method: str, motor: Motor, why: str) -> Identification:
@@ -213,7 +216,7 @@ def _windows(m: Measurement, motor: Motor) -> tuple[list[free.Window], Floats]:
 
 def _why(misfit: float, good: bool, wrong: str) -> str:
     if misfit <= MISFIT:
-        return "nothing can be told: the search for the parameters did not come to an end"
+        return _NO_END
     return (f"the samples are not those of such a motor: {100.0 * misfit:.0f} % of the magnet's flux stays "
             f"unexplained (wrong {wrong})")
 

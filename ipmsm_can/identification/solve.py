@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import t as student
 
 Floats = NDArray[np.float64]
@@ -27,6 +28,10 @@ Model = Callable[[Floats], tuple[Floats, Floats]]
 """p -> (residuals (K,) in units of their scatter, columns (K, P): their derivatives)."""
 
 
+class Unsolvable(ArithmeticError):
+    """The samples are such that the search for the parameters has left where anything can be computed."""
+
+
 @dataclass(frozen=True, slots=True)
 class Solution:
     """values (P,), covariance (P, P), and by how many of its standard errors an interval of 95 % reaches."""
@@ -43,6 +48,7 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
     sigma: what is believed of `values` beforehand, 1-sigma; keeps sound what the samples do not tell.
     Levenberg and Marquardt's damping.  The end is a step far below the standard errors, which no library's solver
     asks for, and no later: columns that are instruments are not quite the derivatives of the cost.
+    Raises Unsolvable.
     """
     at = np.array(free)
     believed = sigma[at] ** -2.0
@@ -59,10 +65,10 @@ def minimise(model: Model, values: Floats, sigma: Floats, low: Floats, high: Flo
         information = product(c, c) + np.diag(believed)
         slope = product(c, residual[:, None])[:, 0] + believed * (p[at] - values[at])
         curvature = np.diag(information)
-        step = -np.linalg.solve(information + damping * np.diag(curvature), slope)
+        step = -inverse(information + damping * np.diag(curvature)) @ slope
         trial = p.copy()
         trial[at] = np.clip(p[at] + np.clip(step, -sigma[at], sigma[at]), low[at], high[at])
-        error = np.sqrt(np.diag(np.linalg.inv(information)))
+        error = np.sqrt(np.diag(inverse(information)))
         moved = float(np.max(np.abs(trial - p)[at] / error))
         with np.errstate(over="ignore", invalid="ignore"):
             residual_there, columns_there = model(trial)
@@ -105,6 +111,17 @@ def product(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.einsum("ki,kj->ij", a, b), np.float64)
 
 
+def inverse(a: Floats) -> Floats:
+    """Of a positive definite matrix.  Raises Unsolvable where rounding leaves it none: columns beyond bounds."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        scale = np.sqrt(np.diag(a))
+        scaled = a / np.outer(scale, scale)
+    try:
+        return np.asarray(cho_solve(cho_factor(scaled), np.eye(scale.size)) / np.outer(scale, scale), np.float64)
+    except ValueError:  # what is not finite, too
+        raise Unsolvable("the parameters cannot be told apart") from None
+
+
 def judge(model: Model, values: Floats, sigma: Floats, time: Floats, first: int,
           given: Sequence[int] = ()) -> Solution:
     """The covariance of a solution.  time (K,): of each residual [s].  first: how many of the parameters matter to
@@ -112,11 +129,12 @@ def judge(model: Model, values: Floats, sigma: Floats, time: Floats, first: int,
 
     The larger one, parameter by parameter, of what white residuals give and of what blocks of them give: residuals
     that remember what came before make the first too small, and few excited blocks the second.
+    Raises Unsolvable.
     """
     residual, columns = model(values)
     fitted = np.setdiff1d(np.arange(values.size), given)
     c = columns[:, fitted]
-    bread = np.linalg.inv(product(c, c) + np.diag(sigma[fitted] ** -2.0))
+    bread = inverse(product(c, c) + np.diag(sigma[fitted] ** -2.0))
     white = bread * float(np.var(residual))
     span = float(time.max() - time.min()) if time.size else 0.0
     length = min(BLOCK_S, max(_LEAST_BLOCK_S, span / _BLOCKS))
