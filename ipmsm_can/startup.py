@@ -336,7 +336,8 @@ class StartUp:
             self._look_along(self.angle)
             triangle = 4.0 * self.frequency * self._motor.L_d  # V per A of its peak
             self._amplitude = min(self.settings.amplitude, _FIRST_TARGET * self.settings.current * triangle)
-            self._last_peak = self._raised = 0.0
+            # Until half of what they drive shows, it is still the probing signal, which may hold as still.
+            self._last_peak, self._raised = 0.0, 0.5 * self._amplitude / triangle
             self._windows_left = round(_PULSES_S * self._rate / self.n)
         elif phase is Phase.KNOWN:
             self._tries = self._lost = 0

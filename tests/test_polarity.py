@@ -232,6 +232,12 @@ def test_after_the_pulses_probing_begins_once(seed: int) -> None:
     assert good, line
 
 
+def test_pulses_are_not_made_stronger_for_what_the_probing_signal_still_drives() -> None:
+    """Two windows of a probing signal that had not given way yet held as still as pulses do: 105 % of rated."""
+    result, = standstill.runs(replace(standstill.CASES[7], observer="riccati"), [642])
+    assert result.phase is Phase.KNOWN and result.pulses < 0.95
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("case", [standstill.CASES[k] for k in (0, 2, 4)], ids=lambda c: c.name)
 def test_dead_time_is_not_taken_for_polarity(case: standstill.Case, seed: int) -> None:
