@@ -11,6 +11,9 @@ from ipmsm_can.frames import FrameBlock
 
 FALLEN_BEHIND_S = 0.5
 """Lag after which lost time is given up instead of being caught up with a flood of frames."""
+FALLEN_BEHIND_AGE = 0.25
+"""The same as a share of estimate_time_to_live, for a drive that may run on the companion's angle: while it caught
+up, the companion would have no time to answer, and the drive would stop for a delay that nobody but it made."""
 
 
 class DriveRunner:
@@ -27,6 +30,7 @@ class DriveRunner:
         self.slips = 0
         """How often the machine was too slow and time was given up."""
         self._tick_s = tick_s
+        self._patience_s = min((_patience(drive) for drive in drives), default=FALLEN_BEHIND_S)
         self._done = [0] * len(drives)
 
     def run(self, stop: Callable[[], bool], observer: Callable[[int, Step], None] | None = None) -> None:
@@ -38,7 +42,7 @@ class DriveRunner:
             late = time.monotonic() - (begin + tick * self._tick_s)
             if late < 0.0:
                 time.sleep(-late)
-            elif late > FALLEN_BEHIND_S:
+            elif late > self._patience_s:
                 begin += late
                 self.slips += 1
             self._advance(tick * self._tick_s, observer)
@@ -59,3 +63,9 @@ class DriveRunner:
         together = FrameBlock.concat(frames)
         if len(together):
             self.sent += self.port.send(together)
+
+
+def _patience(drive: DriveNode) -> float:
+    p = drive.simulation.parameters
+    return FALLEN_BEHIND_S if p.angle_source == "encoder" else min(FALLEN_BEHIND_S,
+                                                                   FALLEN_BEHIND_AGE * p.estimate_time_to_live)
