@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ipmsm_can.bus.drive_runner import DriveRunner
@@ -18,7 +19,9 @@ from ipmsm_can.drive.node import DriveNode
 from ipmsm_can.drive.simulation import DriveSimulation
 from ipmsm_can.frames import FrameBlock
 from ipmsm_can.logs.writer import write_log
+from ipmsm_can.mapping.load import map_folder
 from ipmsm_can.wire.protocol import Protocol
+from tests import mapping_traffic
 from tests.test_mapping_drives import cascadia
 from tests.test_mapping_live import run_live
 from tools.faults import FAULTS, Drive, config, frames, healthy, ordinary_profile
@@ -223,8 +226,20 @@ def test_live_through_a_map_it_finds_what_it_finds_in_a_log_and_sends_nothing(
 def test_live_through_a_map_it_says_why_nothing_can_be_said(tmp_path: Path, late: FrameBlock,
                                                             capsys: pytest.CaptureFixture[str]) -> None:
     given = Path(toml(tmp_path, drive(None)))
+    silent = cascadia(seconds=0.5)
+    silent = silent.take(silent.can_id != 0xA7)  # the message of the voltages
     for block, why in ((late.take(slice(0, 20)), "holds no frame of the map (identifiers 0x0A5"),
-                       (cascadia(seconds=0.5), "does not hold the samples that this takes: "),
+                       (silent, "nothing can be made of the signals: the voltage is a momentary value"),
+                       (silent, "none of the samples have current, voltage and speed"),
                        (late.take(slice(0, 0)), "no frame came on cascadia_pm")):
         code, said, _ = run_live(given, "cascadia_pm", block, capsys, command="diagnose")
         assert code == 2 and why in said and "Traceback" not in said, said
+
+
+def test_a_map_without_a_voltage_allows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    t = np.arange(100) * 2e-2
+    block = mapping_traffic.frames(map_folder() / "vesc.dbc", {
+        "VESC_Status": (t, {"erpm": 3000.0, "current": 5.0 + t, "duty": 0.2})})
+    write_log(tmp_path / "run.log", [block])
+    said = refused(capsys, str(tmp_path / "run.log"), "--drive", toml(tmp_path, drive(None)), "--map", "vesc")
+    assert "neither those of the fast observer (the map has not the voltage of the motor) nor of the " in said

@@ -240,35 +240,48 @@ def read_measurement(log: Path, config: DriveConfig, *, map_name: str | None = N
     if not builder.samples:
         bad = wire.receiver.bad_frames + wire.receiver.sequencer.count("bad_rate")
         raise ValueError(reader.problem or absence(wire.node, seen, protocol, wire.waiting, bad, log, channel))
-    builder.problem = _problem(reader.problem, reader.bad_lines, log)
+    builder.problem = log_problem(reader.problem, reader.bad_lines, log)
     return builder.measurement()
 
 
 def _read_mapped(log: Path, config: DriveConfig, map_name: str, node: int | None, channel: str | None,
                  progress: Callable[[float], None] | None, window_s: float | None) -> Measurement:
-    inverter = load_map(map_name)
-    plan = make_plan(inverter, node=node, pole_pairs=config.build_motor().pole_pairs)
+    survey = surveyed(log, config, map_name, node, channel)
+    fast = abilities(survey)[0]
+    if not fast.able:
+        raise ValueError(f"{log} with the map {map_name} does not hold the samples that this takes: {fast.why}")
+    return measure_mapped(log, config, survey, channel, progress, window_s, f"{log} with the map {map_name}")
+
+
+def surveyed(log: Path, config: DriveConfig, map_name: str, node: int | None, channel: str | None) -> Survey:
+    """The survey of a log of another inverter.  Raises ValueError with one sentence where it holds no sample."""
+    plan = make_plan(load_map(map_name), node=node, pole_pairs=config.build_motor().pole_pairs)
     survey = Survey(plan, config.wire.sample_rate)
     survey.run(read_log(log, channel=channel))
     if not survey.found:
         raise ValueError(wrong_bus(survey, str(log)))
     if not survey.rows:
         raise ValueError(f"{log} holds no sample of the map {map_name}; `ipmsm-can map --check` says why")
-    fast = abilities(survey)[0]
-    if not fast.able:
-        raise ValueError(f"{log} with the map {map_name} does not hold the samples that this takes: {fast.why}")
+    return survey
+
+
+def measure_mapped(log: Path, config: DriveConfig, survey: Survey, channel: str | None,
+                   progress: Callable[[float], None] | None, window_s: float | None, source: str) -> Measurement:
+    """The measurement of another inverter's log whose survey allows the fast observer."""
+    inverter = survey.plan.map
     delay = inverter.voltage.delay if inverter.voltage is not None else 0.0
     reader = read_log(log, channel=channel)
-    builder = MeasurementBuilder(config, pieces=MapPieces(plan, survey.rate), window_s=window_s,
-                                 voltage_delay=delay, source=f"{log} with the map {map_name}")
+    builder = MeasurementBuilder(config, pieces=MapPieces(survey.plan, survey.rate), window_s=window_s,
+                                 voltage_delay=delay, source=source)
     for block in reader:
         builder.feed(block)
         if progress is not None:
             progress(reader.done)
     builder.finish()
-    builder.problem = _problem(reader.problem, reader.bad_lines, log)
+    builder.problem = log_problem(reader.problem, reader.bad_lines, log)
     return builder.measurement()
 
 
-def _problem(problem: str, bad_lines: int, log: Path) -> str:
+def log_problem(problem: str, bad_lines: int, log: Path) -> str:
+    """Why a log was not read to its end or not all of it, "" where it was."""
     return problem or (f"{log} is damaged: {bad_lines} of its lines cannot be read" if bad_lines else "")

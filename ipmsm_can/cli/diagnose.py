@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from ipmsm_can.cli import bus
 
 if TYPE_CHECKING:
-    from ipmsm_can.analysis.measurement import Measurement
     from ipmsm_can.bus.link import Link
     from ipmsm_can.config import DriveConfig
     from ipmsm_can.diagnosis import Report
@@ -114,22 +113,29 @@ def _outputs(args: argparse.Namespace) -> tuple[Path | None, list[Path]]:
 
 
 def _recorded(args: argparse.Namespace, config: DriveConfig) -> tuple[Report, str]:
-    from ipmsm_can.analysis.measurement import read_measurement
+    from ipmsm_can.analysis.measurement import Measurement, read_measurement
+    from ipmsm_can.analysis.steady import SteadySamples, read_mapped
     from ipmsm_can.diagnosis import diagnose
 
+    measurement: Measurement | SteadySamples
     with bus.patience():
-        measurement = read_measurement(
-            Path(args.log), config, map_name=args.map, node=args.node, channel=getattr(args, "channel", None),
-            progress=_progress("reading"), window_s=args.last or LAST_S)
+        log, channel, shown = Path(args.log), getattr(args, "channel", None), _progress("reading")
+        window_s = args.last or LAST_S
+        if args.map is None:
+            measurement = read_measurement(log, config, node=args.node, channel=channel, progress=shown,
+                                           window_s=window_s)
+        else:
+            measurement = read_mapped(log, config, args.map, node=args.node, channel=channel, progress=shown,
+                                      window_s=window_s)
         _clear()
         report = diagnose(measurement, config)
     problem = f"{measurement.problem}; what was readable is in the report" if measurement.problem else ""
-    _check_length(measurement, args)
+    _check_length(measurement.duration, args)
     return report, problem
 
 
-def _check_length(measurement: Measurement, args: argparse.Namespace) -> None:
-    if args.last is None and measurement.duration > 0.99 * LAST_S:
+def _check_length(duration: float, args: argparse.Namespace) -> None:
+    if args.last is None and duration > 0.99 * LAST_S:
         print(f"note: only the last {LAST_S:g} s of the log count; --last says otherwise", file=sys.stderr)
 
 

@@ -10,10 +10,12 @@ import numpy as np
 from ipmsm_can.diagnosis.case import Case
 from ipmsm_can.diagnosis.checks import currents, encoder, estimator, excitation, motor, samples, voltage, wiring
 from ipmsm_can.diagnosis.finding import Checked, Finding, Plot, Report, Series, ranked
+from ipmsm_can.diagnosis.steady import diagnose_steady
 from ipmsm_can.drive.profile import RPM
 
 if TYPE_CHECKING:
     from ipmsm_can.analysis.measurement import Measurement
+    from ipmsm_can.analysis.steady import SteadySamples
     from ipmsm_can.config.model import DriveConfig
 
 CHECKS = (wiring, encoder, currents, voltage, motor, estimator, excitation, samples)
@@ -22,13 +24,17 @@ _LEAST_S = 0.05
 _POINTS = 800
 
 
-def diagnose(measurement: Measurement, config: DriveConfig, *, thorough: bool = True) -> Report:
-    """What is wrong with the drive of `config`, going by a measurement.
+def diagnose(measurement: Measurement | SteadySamples, config: DriveConfig, *, thorough: bool = True) -> Report:
+    """What is wrong with the drive of `config`, going by a measurement, or by samples that are too slow for one.
 
     Nothing found is said as plainly: `Report.checked` tells what was looked at, and what could not be, and why.
     thorough: identify the motor's parameters exactly, which takes a second or so; else quickly.
     The same samples give the same report.
     """
+    from ipmsm_can.analysis.steady import SteadySamples
+
+    if isinstance(measurement, SteadySamples):
+        return diagnose_steady(measurement, config)
     case = Case(measurement, config, thorough)
     facts = _facts(case)
     if case.seconds < _LEAST_S and not (measurement.usable & ~measurement.running).any():

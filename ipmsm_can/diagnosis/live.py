@@ -15,6 +15,7 @@ from ipmsm_can.frames import FrameBlock
 
 if TYPE_CHECKING:
     from ipmsm_can.analysis.pieces import MapPieces
+    from ipmsm_can.analysis.steady import SteadyBuilder
     from ipmsm_can.config.model import DriveConfig
     from ipmsm_can.wire.protocol import Protocol
 
@@ -31,7 +32,8 @@ class LiveDiagnosis:
     config: the drive.  protocol: the wire; None builds the one of wire.dbc.  window_s: how many of the last seconds
     count [s].  every_s: the least time between two judgements [s].  clock: monotonic [s].  pieces: what reads the
     frames instead of our own wire, such as `analysis.pieces.MapPieces`; voltage_delay: by how many samples its
-    voltage is late.
+    voltage is late.  builder: what collects the frames instead, of an inverter whose signals allow the
+    steady-state checks only; with a window of its own.
 
     `feed` only keeps the block; `findings` and `report` decode and judge, in the thread of who asks, which
     therefore must not be the one that receives.
@@ -39,12 +41,13 @@ class LiveDiagnosis:
 
     def __init__(self, config: DriveConfig, protocol: Protocol | None = None, *, window_s: float = WINDOW_S,
                  every_s: float = EVERY_S, clock: Callable[[], float] = time.monotonic,
-                 pieces: MapPieces | None = None, voltage_delay: float = 0.0) -> None:
+                 pieces: MapPieces | None = None, voltage_delay: float = 0.0,
+                 builder: SteadyBuilder | None = None) -> None:
         self.left_out = 0
         """Frames that came faster than anybody asked."""
         self._config = config
-        self._builder = MeasurementBuilder(config, protocol, pieces=pieces, window_s=window_s,
-                                           voltage_delay=voltage_delay, source="live")
+        self._builder = builder or MeasurementBuilder(config, protocol, pieces=pieces, window_s=window_s,
+                                                      voltage_delay=voltage_delay, source="live")
         self._waiting: deque[FrameBlock] = deque()
         self._frames = 0
         self._lock = threading.Lock()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ipmsm_can.analysis.pieces import MapPieces
+from ipmsm_can.analysis.steady import SteadyBuilder
 from ipmsm_can.diagnosis.live import EVERY_S, WINDOW_S, LiveDiagnosis
 from ipmsm_can.frames import CAN_ERR_FLAG, FrameBlock
 from ipmsm_can.mapping.check import no_frame
@@ -18,7 +19,8 @@ _STRANGERS_KEPT = 1000
 
 
 class MappedDiagnosis:
-    """A drive through its map: the diagnosis, once its signals have been looked at and allow the fast observer.
+    """A drive through its map: the diagnosis, once its signals have been looked at and allow the fast observer or
+    the steady-state checks.
 
     config: the drive.  plan: from `make_plan`.  window_s, every_s: as in `LiveDiagnosis`.
     look: at the signals.  diagnosis: None until they allow it.
@@ -51,14 +53,18 @@ class MappedDiagnosis:
 
     def _judge(self, block: FrameBlock | None) -> None:
         allowed = self.look.allowed
-        if block is None or allowed is None or not allowed.fast:
+        if block is None or allowed is None:
             return
-        if self.diagnosis is None:
+        if self.diagnosis is None and allowed.fast:
             voltage = self.look.plan.map.voltage
             self.diagnosis = LiveDiagnosis(
                 self._config, window_s=self._window, every_s=self._every,
                 pieces=MapPieces(self.look.plan, allowed.rate),
                 voltage_delay=0.0 if voltage is None else voltage.delay)
+        elif self.diagnosis is None:
+            self.diagnosis = LiveDiagnosis(
+                self._config, every_s=self._every,
+                builder=SteadyBuilder(self.look.plan, allowed.rate, window_s=self._window))
         self.diagnosis.feed(block)
 
     def _note_strangers(self, block: FrameBlock) -> None:

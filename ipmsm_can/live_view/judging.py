@@ -117,14 +117,18 @@ class DriveSource:
         return _told(self._diagnosis, self._name)
 
 
+DOUBTFUL = "signals.doubtful"
+"""What this says is among the notes of the look at the signals, which are shown anyway."""
+
+
 def _told(diagnosis: LiveDiagnosis, name: str = "") -> list[Told]:
     return [Told(f.severity if f.severity in SEVERITIES else "notice", name + f.sentence, f.advice)
-            for f in diagnosis.findings()]
+            for f in diagnosis.findings() if f.code != DOUBTFUL]
 
 
 class MappedSource:
     """Another inverter through its map: what is missing or doubtful of its signals, and, where they allow the fast
-    observer, the diagnosis of the drive."""
+    observer or the steady-state checks, the diagnosis of the drive."""
 
     def __init__(self, plan: Plan) -> None:
         from ipmsm_can.diagnosis.live_mapped import MappedDiagnosis

@@ -49,20 +49,12 @@ def missing(survey: Survey) -> list[str]:
 
 def doubtful(survey: Survey) -> list[str]:
     """A sentence for everything that is there and cannot be quite right."""
-    out: list[str] = []
-    for c in survey.plan.channels:
-        s = survey.signals[c.number]
-        if c.how != CONSTANT and s.count > 20 and s.low == s.high and c.number <= OMEGA:
-            out.append(f"{c.key} ({c.ref}) never changes: it is {_value(c, s.low)} in all {s.count} reports")
+    out = strange(survey)
     slope = survey.slope
     if math.isfinite(slope) and abs(slope - 1.0) > 0.2:
         told = ("runs against the speed: one of the two has the wrong direction" if slope < -0.5 else
                 f"turns {slope:.2f} times as fast as the speed says: look at electrical, shaft and pole pairs")
         out.append(f"the angle {told}")
-    most = survey.over_dc.percentile(_MOST)
-    if math.isfinite(most) and most > 1.1 * 2.0 / 3.0:
-        out.append(f"the voltage reaches {most:.2f} of the dc voltage, and no inverter gives more than 0.67 (peak, "
-                   "per phase): look at voltage.measure and voltage.per")
     for bit, words in QUALITY.items():
         count = survey.quality[bit]
         if count:
@@ -71,6 +63,20 @@ def doubtful(survey: Survey) -> list[str]:
         out.append(f"{survey.missing} samples are missing between those that came")
     if survey.mapper.dropped:
         out.append(f"{survey.mapper.dropped} samples were repeated or late by their counter, and left out")
+    return out
+
+
+def strange(survey: Survey) -> list[str]:
+    """A sentence for every signal whose values are not those of a drive that runs."""
+    out: list[str] = []
+    for c in survey.plan.channels:
+        s = survey.signals[c.number]
+        if c.how != CONSTANT and s.count > 20 and s.low == s.high and c.number <= OMEGA:
+            out.append(f"{c.key} ({c.ref}) never changes: it is {_value(c, s.low)} in all {s.count} reports")
+    most = survey.over_dc.percentile(_MOST)
+    if math.isfinite(most) and most > 1.1 * 2.0 / 3.0:
+        out.append(f"the voltage reaches {most:.2f} of the dc voltage, and no inverter gives more than 0.67 (peak, "
+                   "per phase): look at voltage.measure and voltage.per")
     return out
 
 

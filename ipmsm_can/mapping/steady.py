@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 STEADY_CURRENT, STEADY_SPEED = 0.05, 0.05
 """Change from one sample to the next that still counts as steady: of the rated current, and of the speed."""
+LEAST_EMF = 2.0
+"""Voltage of the magnets [V] below which the dead time decides, not they."""
 
 
 @dataclass(slots=True)
@@ -86,7 +88,7 @@ class SteadyState:
         small = STEADY_CURRENT * m.rated_current
         steady = (step[0] <= small) & (step[1] <= small) & (step[2] <= STEADY_SPEED * np.abs(w))
         # Below this the resistance and the dead time decide, not the magnets.
-        steady &= np.abs(w) * m.psi_m > np.maximum(m.R * np.hypot(b.i_d, b.i_q), 2.0)
+        steady &= np.abs(w) * m.psi_m > np.maximum(m.R * np.hypot(b.i_d, b.i_q), LEAST_EMF)
         steady &= b.quality & self._spoils == 0
         with np.errstate(divide="ignore", invalid="ignore"):
             psi = np.where(steady, (b.v_q - m.R * b.i_q) / w - m.L_d * b.i_d, np.nan)

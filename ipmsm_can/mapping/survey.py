@@ -138,15 +138,22 @@ class Survey:
     def run(self, blocks: Iterable[FrameBlock]) -> None:
         """Take in a whole log."""
         for block in blocks:
-            if not len(block):
-                continue
+            self.feed(block)
+        self.finish()
+
+    def feed(self, block: FrameBlock) -> MappedBlock:
+        """Take in the next frames; the samples that they complete."""
+        if len(block):
             self.begin_ns = self.begin_ns or int(block.t_ns[0])
             self.end_ns = int(block.t_ns[-1])
             if len(self.identifiers) < _IDS_KEPT:
                 ids = block.can_id[(block.can_id & np.uint32(CAN_ERR_FLAG)) == 0]
                 self.identifiers.update(np.unique(ids & np.uint32(CAN_EFF_FLAG | CAN_EFF_MASK)).tolist())
-            self._samples(self.mapper.feed(block))
-        self._samples(self.mapper.flush())
+        return self._samples(self.mapper.feed(block))
+
+    def finish(self) -> MappedBlock:
+        """Nothing more comes; the samples that waited for later reports."""
+        return self._samples(self.mapper.flush())
 
     def _reports(self, t_ns: Ints, frames: Floats) -> None:
         for number, s in self.signals.items():
@@ -163,9 +170,9 @@ class Survey:
             s.low = min(s.low, float(finite.min(initial=math.inf)))
             s.high = max(s.high, float(finite.max(initial=-math.inf)))
 
-    def _samples(self, b: MappedBlock) -> None:
+    def _samples(self, b: MappedBlock) -> MappedBlock:
         if not len(b):
-            return
+            return b
         self.rows += len(b)
         self.missing += int(b.gap[b.gap < RESTARTED].sum())
         for bit in self.quality:
@@ -184,6 +191,7 @@ class Survey:
         good = b.v_dc > 0.0
         self.over_dc.add(length[good] / b.v_dc[good])
         self._follow(b)
+        return b
 
     def _follow(self, b: MappedBlock) -> None:
         """Hold the angle's own speed against the reported one, where the turn between two samples is small."""

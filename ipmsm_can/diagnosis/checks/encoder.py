@@ -37,25 +37,35 @@ def _direction(case: Case) -> tuple[list[Finding], list[Checked]]:
                         expected="of the shaft, with the motor's pole pairs"),
                Evidence("by current and voltage", _speed(case, w.encoder_ratio) / RPM, "rpm"))
     if w.encoder_ratio < 0.0:
-        findings.append(Finding(
-            "encoder.direction", "error", "the encoder counts backwards",
-            "The encoder's angle falls while the motor's field turns forwards. Either it counts backwards, or two "
-            "phases are swapped in current and voltage alike, as when two motor cables are swapped.",
-            "Reverse the encoder's direction in the map or the firmware; if the shaft turns against the reference, "
-            "swap two motor cables instead.", numbers, order=1))
+        findings.append(direction_finding(numbers))
     if ratio != 1.0:
-        pairs = motor.pole_pairs / ratio
-        findings.append(Finding(
-            "encoder.pole_pairs", "error", "the encoder's pole pairs are wrong",
-            f"The encoder's electrical angle turns {pairs / motor.pole_pairs:.4g} times as fast as the motor's "
-            f"field: it is made with {pairs:.4g} pole pairs, and the motor has {motor.pole_pairs}.",
-            "Correct the number of pole pairs that the encoder's angle is multiplied by; a resolver's own pole "
-            "pairs count, too.", numbers, order=1))
+        findings.append(pole_pairs_finding(motor.pole_pairs / ratio, motor.pole_pairs, numbers))
     if findings:
         return findings, [Checked("encoder's direction and pole pairs", "found", findings[0].title)]
     state = "fine" if w.direction_known else "untold"
     words = "as the field turns" if w.direction_known else "another explanation fits as well"
     return [], [Checked("encoder's direction and pole pairs", state, words)]  # type: ignore[arg-type]
+
+
+def direction_finding(numbers: tuple[Evidence, ...], doubt: str = "", plot: Plot | None = None) -> Finding:
+    """That the angle falls while the field turns forwards.  doubt: another sentence, " ..." or ""."""
+    return Finding(
+        "encoder.direction", "error", "the encoder counts backwards",
+        "The encoder's angle falls while the motor's field turns forwards. Either it counts backwards, or two "
+        f"phases are swapped in current and voltage alike, as when two motor cables are swapped.{doubt}",
+        "Reverse the encoder's direction in the map or the firmware; if the shaft turns against the reference, "
+        "swap two motor cables instead.", numbers, plot, order=1)
+
+
+def pole_pairs_finding(pairs: float, pole_pairs: int, numbers: tuple[Evidence, ...], doubt: str = "",
+                       plot: Plot | None = None) -> Finding:
+    """That the angle is made with `pairs` pole pairs instead of the motor's.  doubt: another sentence, or ""."""
+    return Finding(
+        "encoder.pole_pairs", "error", "the encoder's pole pairs are wrong",
+        f"The encoder's electrical angle turns {pairs / pole_pairs:.4g} times as fast as the motor's "
+        f"field: it is made with {pairs:.4g} pole pairs, and the motor has {pole_pairs}.{doubt}",
+        "Correct the number of pole pairs that the encoder's angle is multiplied by; a resolver's own pole "
+        "pairs count, too.", numbers, plot, order=1)
 
 
 def _speed(case: Case, ratio: float) -> float:
@@ -104,15 +114,21 @@ def _zero(case: Case) -> tuple[list[Finding], list[Checked]]:
     if not told(zero, sigma, limits.ZERO):
         words = f"{zero * DEGREES:+.2f} deg electrical" if seen(sigma, limits.ZERO) else "cannot be told here"
         return [], [Checked("encoder's zero", "fine" if seen(sigma, limits.ZERO) else "untold", words)]
+    plot = _course_plot(case, "Around the level that this finding tells.")
+    return [zero_finding(zero, sigma, plot)], [
+        Checked("encoder's zero", "found", f"{zero * DEGREES:+.1f} deg electrical")]
+
+
+def zero_finding(zero: float, sigma: float, plot: Plot | None) -> Finding:
+    """That the angle says so much more than the rotor's [rad electrical]."""
     half = abs(abs(zero) - math.pi) < math.radians(20.0)
     both = " Half a turn also comes from current and voltage both reversed." if half else ""
-    return [Finding(
+    return Finding(
         "encoder.zero", "error" if abs(zero) > limits.ZERO_ERROR else "warning", "the encoder's zero is off",
         f"The encoder says {zero * DEGREES:+.1f} deg electrical more than the angle of the magnets.{both}",
         "Set the encoder's zero anew: subtract this from its angle.",
-        (evidence("encoder minus rotor", zero, sigma, "deg electrical", factor=DEGREES),),
-        _course_plot(case, "Around the level that this finding tells."), size=abs(zero) / limits.ZERO, order=3)], [
-            Checked("encoder's zero", "found", f"{zero * DEGREES:+.1f} deg electrical")]
+        (evidence("encoder minus rotor", zero, sigma, "deg electrical", factor=DEGREES),), plot,
+        size=abs(zero) / limits.ZERO, order=3)
 
 
 def _eccentricity(case: Case) -> tuple[list[Finding], list[Checked]]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +13,9 @@ from ipmsm_can.diagnosis import limits
 from ipmsm_can.diagnosis.case import Case, Fit
 from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding
 from ipmsm_can.diagnosis.parts import evidence
+
+if TYPE_CHECKING:
+    from ipmsm_can.config.model import DriveConfig
 
 _COPPER = 0.00393
 """Rise of the resistance of copper with temperature [1/K]."""
@@ -53,10 +58,7 @@ def parameters(case: Case) -> list[Parameter]:
     it counts as unknown, whatever the fit says.
     """
     fit = case.fit
-    o, motor = case.config.observer, case.motor
-    inductance = limits.TOLERANCE * o.inductance_uncertainty / 100.0
-    limit = {"psi_m": limits.PSI_M, "R": limits.TOLERANCE * o.resistance_uncertainty / 100.0, "L_q": inductance,
-             "L_d": inductance}
+    motor, limit = case.motor, allowed(case.config)
     along_d = fit is not None and _moves_along_d(fit, limits.ALONG_D * motor.rated_current)
     if case.identified is not None:
         exact = case.identified.parameters
@@ -71,8 +73,9 @@ def parameters(case: Case) -> list[Parameter]:
            Parameter("R", s["R"], s.sigma("R"), motor.R, limit["R"])]
     if case.by_encoder:
         # An angle of the observer's holds its own L_q.
-        out += [Parameter("L_q", s["L_q"], s.sigma("L_q"), motor.L_q, inductance),
-                Parameter("L_d", s["L_d"], s.sigma("L_d") if along_d else math.inf, motor.L_d, inductance)]
+        out += [Parameter("L_q", s["L_q"], s.sigma("L_q"), motor.L_q, limit["L_q"]),
+                Parameter("L_d", s["L_d"], s.sigma("L_d") if along_d else math.inf, motor.L_d,
+                          limit["L_d"])]
     return out
 
 
@@ -87,18 +90,33 @@ def check(case: Case) -> tuple[list[Finding], list[Checked]]:
     found = parameters(case)
     if not found:
         return [], [Checked("motor's parameters", "untold", "too few samples of a running drive")]
+    findings, checked = judge(found, case.config, lambda name: _why(name, case.by_encoder))
+    if not case.by_encoder and case.identified is None:
+        checked += [Checked(name, "untold", _why(name, False)) for name in ("L_q", "L_d")]
+    return findings, checked
+
+
+def allowed(config: DriveConfig) -> dict[str, float]:
+    """By which share each parameter may differ from drive.toml."""
+    o = config.observer
+    inductance = limits.TOLERANCE * o.inductance_uncertainty / 100.0
+    return {"psi_m": limits.PSI_M, "R": limits.TOLERANCE * o.resistance_uncertainty / 100.0, "L_q": inductance,
+            "L_d": inductance}
+
+
+def judge(found: list[Parameter], config: DriveConfig, why: Callable[[str], str]) -> tuple[list[Finding],
+                                                                                         list[Checked]]:
+    """Findings of parameters, and what was looked at.  why: what is said of one that is not known."""
     table = tuple(_evidence(p) for p in found if p.known)
-    findings = [_finding(case, p, table) for p in found if p.off]
+    findings = [_finding(config, p, table) for p in found if p.off]
     checked = []
     for p in found:
         unit, factor = _UNIT[p.name]
         if not p.known:
-            checked.append(Checked(p.name, "untold", _why(p.name, case.by_encoder)))
+            checked.append(Checked(p.name, "untold", why(p.name)))
         else:
             words = f"{factor * p.value:.4g} {unit}, {100.0 * p.share:+.1f} % against drive.toml"
             checked.append(Checked(p.name, "found" if p.off else "fine", words))
-    if not case.by_encoder and case.identified is None:
-        checked += [Checked(name, "untold", _why(name, False)) for name in ("L_q", "L_d")]
     return findings, checked
 
 
@@ -115,12 +133,12 @@ def _evidence(p: Parameter) -> Evidence:
     return evidence(p.name, p.value, p.sigma, unit, f"drive.toml {factor * p.plate:.4g} {unit}", factor)
 
 
-def _finding(case: Case, p: Parameter, table: tuple[Evidence, ...]) -> Finding:
+def _finding(config: DriveConfig, p: Parameter, table: tuple[Evidence, ...]) -> Finding:
     change = f"{100.0 * abs(p.share):.0f} % {'more' if p.share > 0.0 else 'less'}"
-    title, sentence, advice = _words(case, p, change)
+    title, sentence, advice = _words(p, change)
     # Iron that saturates lowers L_q; L_d falls or rises with the sign of i_d, and falls with i_q.  drive.toml tells
     # how far that may go, as 1-sigma.
-    iron = case.config.observer.saturation_uncertainty / 100.0
+    iron = config.observer.saturation_uncertainty / 100.0
     saturates = (p.name == "L_d" and abs(p.share) < p.limit + limits.TOLERANCE * iron) or (
         p.name == "L_q" and 0.0 < -p.share < p.limit + iron)
     if saturates:
@@ -129,7 +147,7 @@ def _finding(case: Case, p: Parameter, table: tuple[Evidence, ...]) -> Finding:
                    size=abs(p.share) / p.limit, order=4 if saturates else 3)
 
 
-def _words(case: Case, p: Parameter, change: str) -> tuple[str, str, str]:
+def _words(p: Parameter, change: str) -> tuple[str, str, str]:
     unit, factor = _UNIT[p.name]
     value = f"{factor * p.value:.4g} {unit}"
     if p.name == "psi_m" and p.share < 0.0:

@@ -14,15 +14,7 @@ def check(case: Case) -> tuple[list[Finding], list[Checked]]:
     m, count = case.m, case.m.counts.get
     findings: list[Finding] = []
     received, lost = count("received", len(m)), count("lost", 0)
-    share = lost / max(1, received + lost)
-    if share > limits.LOST:
-        much = share > limits.LOST_MUCH
-        findings.append(Finding(
-            "samples.lost", "warning" if much else "info", "samples are lost",
-            f"{100 * share:.1f} % of the drive's samples did not arrive.",
-            "See `ipmsm-can bus` for where they get lost: on the bus, in the kernel, or in the adapter.",
-            (Evidence("lost", lost, "samples"), Evidence("gaps too long to fill", count("gaps", 0))),
-            size=share / limits.LOST, order=5))
+    findings += lost_finding(received, lost, (Evidence("gaps too long to fill", count("gaps", 0)),))
     clipped = int(np.count_nonzero(m.clipped))
     if clipped:
         findings.append(Finding(
@@ -45,6 +37,18 @@ def check(case: Case) -> tuple[list[Finding], list[Checked]]:
             (Evidence("restarts", restarts),), order=6))
     words = f"{received} received, {lost} lost, {clipped} cut off"
     return findings, [Checked("samples", "found" if findings else "fine", words), *_running(case)]
+
+
+def lost_finding(received: int, lost: int, more: tuple[Evidence, ...] = ()) -> list[Finding]:
+    """That samples did not arrive, where it was more than a few."""
+    share = lost / max(1, received + lost)
+    if share <= limits.LOST:
+        return []
+    return [Finding(
+        "samples.lost", "warning" if share > limits.LOST_MUCH else "info", "samples are lost",
+        f"{100 * share:.1f} % of the drive's samples did not arrive.",
+        "See `ipmsm-can bus` for where they get lost: on the bus, in the kernel, or in the adapter.",
+        (Evidence("lost", lost, "samples"), *more), size=share / limits.LOST, order=5)]
 
 
 def _running(case: Case) -> list[Checked]:

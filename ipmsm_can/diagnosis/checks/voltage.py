@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ipmsm_can.diagnosis import limits
 from ipmsm_can.diagnosis.case import Case
-from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding
+from ipmsm_can.diagnosis.finding import Checked, Evidence, Finding, Plot
 from ipmsm_can.diagnosis.parts import evidence, explained, seen, told
 
 
@@ -55,16 +55,23 @@ def _dead_time(case: Case) -> tuple[list[Finding], Checked]:
         return [], Checked("dead time", "untold", "the current hardly changed its size")
     if not told(volts, sigma, limit) or volts < 0.0:
         return [], Checked("dead time", "fine", f"{volts:.2f} V a phase")
-    return [Finding(
+    plot = explained(case, fit, ("dead_time",), "dead time")
+    return [dead_time_finding(volts, sigma, case.volts, plot)], Checked("dead time", "found",
+                                                                        f"{volts:.2f} V a phase")
+
+
+def dead_time_finding(volts: float, sigma: float, allowed: float, plot: Plot | None) -> Finding:
+    """That each phase loses so much [V].  allowed: what drive.toml says, as 1-sigma [V]."""
+    limit = limits.VOLTAGE * allowed
+    return Finding(
         "voltage.dead_time", "warning", "dead time takes much voltage",
-        f"Each phase loses {volts:.2f} V against its current, more than the {case.volts:g} V that drive.toml "
+        f"Each phase loses {volts:.2f} V against its current, more than the {allowed:g} V that drive.toml "
         "allows as 1-sigma. At low speed the angle suffers, and the torque ripples six times a turn.",
         "Compensate the dead time in the drive and report the voltage that is really applied, or raise "
         "observer.voltage_uncertainty.",
         (evidence("voltage lost by each phase", volts, sigma, "V"),
          Evidence("limit", limit, "V", expected=f"{limits.VOLTAGE:g} times observer.voltage_uncertainty")),
-        explained(case, fit, ("dead_time",), "dead time"), size=volts / limit, order=3)], Checked(
-            "dead time", "found", f"{volts:.2f} V a phase")
+        plot, size=volts / limit, order=3)
 
 
 def _offset(case: Case) -> tuple[list[Finding], Checked]:

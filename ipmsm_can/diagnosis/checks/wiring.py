@@ -35,13 +35,7 @@ def _finding(case: Case, what: str, mirrored: bool, sixths: int) -> Finding:
     reversed_too = sixths % 2 == 1
     thirds = (sixths + 3 if reversed_too else sixths) % 6 // 2
     if not mirrored and sixths == 3:
-        return Finding(
-            f"wiring.{what}_sign", "error", f"the {what} is reversed",
-            f"The reported {what} has the wrong sign: with it the motor would have a negative resistance and "
-            f"negative inductances, and energy would flow the wrong way.{doubt}",
-            f"Reverse the sign of the {what} in the map or the firmware"
-            + (", or turn the current sensors round." if what == "current" else "."),
-            _numbers(case), _power(case), order=0)
+        return sign_finding(what, doubt, _numbers(case), _power(case))
     sign = " and reversed" if reversed_too else ""
     if mirrored:
         pair = SWAPPED[thirds]
@@ -55,6 +49,16 @@ def _finding(case: Case, what: str, mirrored: bool, sixths: int) -> Finding:
         f"The reported {what} is turned by 120 deg against the {other}: where a, b, c are reported stand the "
         f"phases {_CYCLIC.get(2 * thirds, 'a, b, c')}{sign}.{doubt}",
         f"Put the phases of the {what} in order in the map or the firmware.", _numbers(case), _power(case), order=0)
+
+
+def sign_finding(what: str, doubt: str, numbers: tuple[Evidence, ...], plot: Plot | None) -> Finding:
+    """That `what`, "current" or "voltage", is reversed.  doubt: another sentence, " ..." or ""."""
+    return Finding(
+        f"wiring.{what}_sign", "error", f"the {what} is reversed",
+        f"The reported {what} has the wrong sign: with it the motor would have a negative resistance and "
+        f"negative inductances, and energy would flow the wrong way.{doubt}",
+        f"Reverse the sign of the {what} in the map or the firmware"
+        + (", or turn the current sensors round." if what == "current" else "."), numbers, plot, order=0)
 
 
 def _numbers(case: Case) -> tuple[Evidence, ...]:
