@@ -11,9 +11,10 @@ from ipmsm_can.frames import FrameBlock
 
 FALLEN_BEHIND_S = 0.5
 """Lag after which lost time is given up instead of being caught up with a flood of frames."""
-FALLEN_BEHIND_AGE = 0.25
-"""The same as a share of estimate_time_to_live, for a drive that may run on the companion's angle: while it caught
-up, the companion would have no time to answer, and the drive would stop for a delay that nobody but it made."""
+FALLEN_BEHIND_ANSWERED_S = 2.5e-3
+"""The same for a drive that may run on the companion's angle, a quarter of how long an estimate lives by default:
+while it caught up the companion would have no time to answer, or would find the samples too old to, and the drive
+would stop for a delay that nobody but it made."""
 
 
 class DriveRunner:
@@ -66,6 +67,5 @@ class DriveRunner:
 
 
 def _patience(drive: DriveNode) -> float:
-    p = drive.simulation.parameters
-    return FALLEN_BEHIND_S if p.angle_source == "encoder" else min(FALLEN_BEHIND_S,
-                                                                   FALLEN_BEHIND_AGE * p.estimate_time_to_live)
+    on_encoder = drive.simulation.parameters.angle_source == "encoder"
+    return FALLEN_BEHIND_S if on_encoder else FALLEN_BEHIND_ANSWERED_S
