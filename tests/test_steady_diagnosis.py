@@ -15,8 +15,9 @@ from ipmsm_can.analysis import steady as analysis
 from ipmsm_can.analysis.measurement import Measurement
 from ipmsm_can.analysis.steady import SteadyBuilder, SteadySamples, read_mapped
 from ipmsm_can.cli import main
-from ipmsm_can.diagnosis import Report, diagnose
+from ipmsm_can.diagnosis import Report, diagnose, limits
 from ipmsm_can.diagnosis import steady_points as pointing
+from ipmsm_can.diagnosis.checks import motor as motors
 from ipmsm_can.diagnosis.live_mapped import MappedDiagnosis
 from ipmsm_can.diagnosis.steady import SteadyCase
 from ipmsm_can.diagnosis.steady_fit import NAMES, Equation
@@ -376,3 +377,10 @@ def test_a_map_that_allows_the_fast_observer_gets_it(tmp_path: Path) -> None:
 
     write_log(tmp_path / "a.log", [drive_frames(Protocol(), 0.5, reference_rate=500.0)])
     assert isinstance(read_mapped(tmp_path / "a.log", told(M2), "ipmsm_can"), Measurement)
+
+
+def test_magnets_of_another_motor_altogether_are_not_too_far_off_to_be_told() -> None:
+    """Their uncertainty is small beside them, though not beside the name plate's."""
+    found = motors.Parameter("psi_m", 0.644, 0.0113, 0.11, limits.PSI_M)
+    assert found.known and found.off
+    assert not motors.Parameter("psi_m", 0.12, 0.0113, 0.11, limits.PSI_M).known

@@ -41,8 +41,8 @@ class Parameter:
 
     @property
     def known(self) -> bool:
-        """A deviation at the limit would be seen."""
-        return self.sigma > 0.0 and self.sigma < 0.5 * self.limit * self.plate
+        """A deviation at the limit would be seen: of the larger of the two, lest one by a factor go unseen."""
+        return self.sigma > 0.0 and self.sigma < 0.5 * self.limit * max(self.plate, self.value)
 
     @property
     def off(self) -> bool:
