@@ -270,8 +270,7 @@ def said(name: str, frames: FrameBlock) -> list[tuple[str, str]]:
 def test_findings_say_why_there_is_no_angle_and_what_is_doubtful(fast: FrameBlock) -> None:
     found = said("cascadia_pm", cascadia(seconds=3.0))
     # the made-up motor has a pole pair more than the drive.toml says
-    assert found[0] == ("warning", "The reported torque is 132 % of that of currents and fitted motor. Another "
-                        "psi_m in the drive does not explain so much.")
+    assert found[0] == ("warning", "The reported torque is 132 % of that of currents and fitted motor.")
     assert found[1][0] == "notice" and found[1][1].startswith("Steady-state quantities only: the voltage is a mom")
     assert any(sentence.startswith("Of the map: speed.signal") for _, sentence in found)
     strange = fast.take(np.arange(len(fast)))

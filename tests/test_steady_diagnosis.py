@@ -84,7 +84,8 @@ def test_a_healthy_drive_has_no_finding_and_its_values_within_their_intervals(
     assert abs(fit["dead_time"] - 0.5) < 2.5 * fit.sigma("dead_time") < 2.5 * 0.25
     assert abs(c.zero) < 2.5 * fit.sigma("delta") < 1.5 * DEG
     states = {k.name: k.state for k in found.checked}
-    for fine in ("signs of current, voltage and speed", "zero of the reported angle", "psi_m", "L_q"):
+    zero = "zero of the reported angle" if name == "cascadia_pm" else "zero of the drive's own d and q"
+    for fine in ("signs of current, voltage and speed", zero, "psi_m", "L_q"):
         assert states[fine] == "fine", fine
     assert "no fast observer: the voltage is a momentary value" in found.checked[-1].words
 
@@ -384,3 +385,34 @@ def test_magnets_of_another_motor_altogether_are_not_too_far_off_to_be_told() ->
     found = motors.Parameter("psi_m", 0.644, 0.0113, 0.11, limits.PSI_M)
     assert found.known and found.off
     assert not motors.Parameter("psi_m", 0.12, 0.0113, 0.11, limits.PSI_M).known
+    unsure = motors.Parameter("psi_m", 0.12, 0.004, 0.11, limits.PSI_M)
+    findings, checked = motors.judge([unsure], told(M2), lambda name: "")
+    assert unsure.known and not findings and checked[0].state == "untold" and "not surely" in checked[0].words
+
+
+def test_an_angle_that_nothing_goes_through_is_not_called_fine(tmp_path: Path) -> None:
+    """Currents and voltages in the drive's own d and q say nothing of an angle that is reported beside them."""
+    for shown in (0.0, 15 * DEG):
+        found = report(case(tmp_path, CAR, CAR, "cascadia_pm_dq", Wrong(shown_zero=shown)))
+        states = {k.name: k.state for k in found.checked}
+        assert states["zero of the reported angle"] == "untold"
+        assert states["zero of the drive's own d and q"] == "fine"
+
+
+def test_a_torque_that_the_drive_makes_of_the_name_plate_is_no_finding_of_its_own(tmp_path: Path) -> None:
+    """Magnets a fifth weak, and a drive that does not know it."""
+    found = report(case(tmp_path, M2, scaled(M2, psi_m=0.8), "cascadia_pm_dq", Wrong(torque=1.25)))
+    assert [f.code for f in found.findings if f.severity != "info"] == ["motor.psi_m"]
+    words = next(k.words for k in found.checked if k.name == "reported torque")
+    assert "drive.toml's motor" in words
+
+
+def test_a_rotor_that_is_mostly_too_fast_for_the_map_is_judged_where_it_is_not(tmp_path: Path) -> None:
+    """Far less than half of the samples have an angle near enough to the current; there are enough of them."""
+    samples = simulated(CAR, top_rpm=3200.0, seconds=16.0)
+    write_log(tmp_path / "run.log", [cascadia(samples, CAR.pole_pairs)])
+    drive = told(CAR)
+    measured = read_mapped(tmp_path / "run.log", drive, "cascadia_pm")
+    assert isinstance(measured, SteadySamples) and 100 < np.count_nonzero(measured.good) < 0.5 * len(measured)
+    found = diagnose(measured, drive)
+    assert "samples.apart" in {f.code for f in found.findings} and found.exit_code == 0

@@ -30,9 +30,9 @@ EPILOG = """\
 examples:
   ipmsm-can diagnose run.blf --drive drive.toml
   ipmsm-can diagnose run.blf --drive drive.toml --out diagnosis.html    a page, and diagnosis.json beside it
-  ipmsm-can diagnose car.blf --drive drive.toml --map cascadia_pm       another inverter, through its map
+  ipmsm-can diagnose car.blf --drive drive.toml --map cascadia_pm_dq    another inverter, through its map
   ipmsm-can diagnose --drive drive.toml -i socketcan -c can0 --duration 10
-  ipmsm-can diagnose --drive drive.toml -i socketcan -c can0 --duration 10 --map cascadia_pm
+  ipmsm-can diagnose --drive drive.toml -i socketcan -c can0 --duration 10 --map cascadia_pm_dq
 
 With LOG, -c names a channel of the log. The more the drive does meanwhile (both directions, several speeds and
 loads), the more can be told; what cannot is said. docs/diagnose.md explains each finding.

@@ -20,7 +20,7 @@ needs. Nothing is transmitted.
 examples:
   ipmsm-can identify run.blf --drive drive.toml
   ipmsm-can identify run.blf --drive drive.toml --out drive.identified.toml
-  ipmsm-can identify car.blf --drive drive.toml --map cascadia_pm --json
+  ipmsm-can identify car.blf --drive drive.toml --map mine.toml --json
 
 exit codes: 0 at least one parameter is told, 1 none is, 2 bad input; a log that is cut off or damaged is bad input,
 too: what was readable of it is used, and one sentence says what was wrong

@@ -33,8 +33,8 @@ examples:
   ipmsm-can monitor drive.toml --log run.blf --speed 2        a recording, twice as fast as it came
   ipmsm-can monitor drive.toml -i socketcan -c can0           a live bus, listening
   ipmsm-can monitor drive.toml -i socketcan -c can0 --transmit
-  ipmsm-can monitor drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm      another inverter, live
-  ipmsm-can monitor drive.toml --log run.blf --map cascadia_pm                       and as a recording
+  ipmsm-can monitor drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm_dq   another inverter, live
+  ipmsm-can monitor drive.toml --log run.blf --map cascadia_pm_dq                    and as a recording
   ipmsm-can monitor left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000
 
 Press h for the keys. Where standard output is not a terminal there is one line a second, as of `run`. NO_COLOR is

@@ -50,7 +50,7 @@ examples:
   ipmsm-can replay run.log.gz --drive drive.toml --out estimates.parquet
   ipmsm-can replay run.blf --drive drive.toml --out run.mf4
   ipmsm-can replay both.asc --drive a.toml --drive b.toml --out estimates.csv
-  ipmsm-can replay car.blf --drive drive.toml --map cascadia_pm
+  ipmsm-can replay car.blf --drive drive.toml --map cascadia_pm_dq
 
 exit codes: 0 all well, 2 bad input; a log that is cut off or damaged is bad input, too: what was readable of it is
 replayed, and one sentence says what was wrong

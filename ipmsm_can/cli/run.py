@@ -24,7 +24,7 @@ examples:
   ipmsm-can run drive.toml -i socketcan -c can0 --transmit    answer: position, status, probing commands
   ipmsm-can run left.toml right.toml -i pcan -c PCAN_USBBUS1 -b 1000000 --duration 60
   ipmsm-can run drive.toml -i socketcan -c can0 --record run.blf --measure run.mf4
-  ipmsm-can run drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm
+  ipmsm-can run drive.toml -i socketcan -c can0 -b 500000 --map cascadia_pm_dq
   CAN_INTERFACE=socketcan CAN_CHANNEL=can0 ipmsm-can run drive.toml | tee run.txt
 
 On a terminal the status is a picture, elsewhere one line a second.  Ctrl-C or SIGTERM ends it with a summary.

@@ -137,7 +137,9 @@ def signs(case: SteadyCase) -> Found:
 
 def zero(case: SteadyCase) -> Found:
     """The reported frame against the rotor, and the reported angle against the frame of d and q."""
-    fit, name = case.fit, "zero of the reported angle"
+    # currents and voltages in the drive's own d and q tell where those stand, and nothing of an angle beside them
+    own = not (case.s.i_by_angle or case.s.v_by_angle)
+    fit, name = case.fit, "zero of the drive's own d and q" if own else "zero of the reported angle"
     if case.against_both or case.angle_reversed:
         return [], [Checked(name, "untold", "the direction is wrong")]
     findings = []
@@ -156,6 +158,9 @@ def zero(case: SteadyCase) -> Found:
         checked = [Checked(name, "untold", f"only to {limits.SIGMAS_95 * sigma * DEGREES:.0f} deg (95 %): "
                            f"{_too_alike(case)}; an L_q that is off, or a voltage that is late, is an angle there")]
     more, also = _frames(case)
+    if own and np.isfinite(case.s.theta).any():
+        also = [Checked("zero of the reported angle", "untold",
+                        "neither current nor voltage goes through it: both are in the drive's own d and q")]
     return findings + more, checked + also
 
 
@@ -179,7 +184,7 @@ def _frames(case: SteadyCase) -> Found:
         return [finding], [Checked(name, "found", f"{turned * DEGREES:+.1f} deg electrical")]
     if seen(sigma, limits.ZERO):
         return [], [Checked(name, "fine", f"{turned * DEGREES:+.1f} deg electrical")]
-    return [], [Checked(name, "untold", "there was too little current")]
+    return [], [Checked(name, "untold", "there was too little current, or always at the same speed")]
 
 
 def motor(case: SteadyCase) -> Found:
@@ -233,8 +238,9 @@ def _otherwise(case: SteadyCase, l_q: motors.Parameter) -> str:
 def torque(case: SteadyCase) -> Found:
     """The reported torque against that of the fitted machine.
 
-    A drive makes its torque from currents and a psi_m of its own, which may be off as psi_m may; so beyond
-    limits.PSI_M it is worth knowing, and beyond twice that another psi_m does not explain it.
+    A drive makes its torque from currents and parameters of its own.  Where those are drive.toml's, the torque is
+    off because the motor is, and that is told of the motor; else beyond limits.PSI_M it is worth knowing, beyond
+    twice that a warning.
     """
     p, fit, name = case.points, case.fit, "reported torque"
     turn = (-1.0 if fit.current_reversed else 1.0) * np.exp(1j * (fit["delta"] + fit["turned"]))
@@ -258,15 +264,19 @@ def torque(case: SteadyCase) -> Found:
     if not told(off, sigma, limit):
         return [], [Checked(name, "fine" if seen(sigma, limit) else "untold", words)]
     much = abs(off) > 2.0 * limit
+    plate = case.motor
+    named = (1.5 * plate.pole_pairs * (plate.psi_m + plate.L_0 * p.i.real) * p.i.imag)[good]
+    if abs(float(named @ y / (named @ named)) - 1.0) < 0.5 * limit:
+        return [], [Checked(name, "fine", f"{words}, and that of the currents with drive.toml's motor: the drive "
+                            "takes the motor for that one")]
     ends = np.array([min(x.min(), 0.0), max(x.max(), 0.0)])
     plot = Plot("Torque", "of currents and fitted motor [N m]", "as reported [N m]",
                 (Series("operating points", x, y, "error", dots=True), Series("alike", ends, ends, "estimate")))
     return [Finding(
         "torque.scale", "warning" if much else "info", "the reported torque is not the motor's",
-        f"The reported torque is {words}."
-        + (" Another psi_m in the drive does not explain so much." if much else ""),
-        "Correct the motor's parameters in the drive, the scaling of the torque in the map, or motor.pole_pairs "
-        "here.",
+        f"The reported torque is {words}.",
+        "See the findings above it first; else correct the motor's parameters in the drive, the scaling or sign of "
+        "the torque in the map, or motor.pole_pairs here.",
         (evidence("reported torque over the motor's", k, sigma, ""),), plot, size=abs(off) / limit, order=4)], [
             Checked(name, "found", words)]
 
@@ -280,7 +290,9 @@ def _too_alike(case: SteadyCase) -> str:
 def _why(case: SteadyCase, name: str) -> str:
     share = 100.0 * case.fit.sigma(name) / max(getattr(case.motor, name), 1e-12)
     if name == "psi_m":
-        return f"only to {limits.SIGMAS_95 * share:.0f} % (95 %): too few operating points turn fast"
+        off = 100.0 * (case.fit[name] / case.motor.psi_m - 1.0)
+        return (f"{off:+.0f} % against drive.toml, but only to {limits.SIGMAS_95 * share:.0f} % (95 %): too few "
+                "operating points, or too much alike")
     known = f"to {limits.SIGMAS_95 * share:.0f} % (95 %) only, hardly better than drive.toml: "
     if name == "R" and len(case.points) > 1:
         return f"{known}it takes too little of the voltage to be told from dead time"

@@ -21,6 +21,8 @@ _MOST = 0.99
 _NEARLY = 0.99
 """A rate found from arrival times is never quite the one that is meant."""
 _SHARE_NEEDED = 0.5
+_ENOUGH = 100
+"""Samples that steady state can be told from, however many others are reported too far apart in time."""
 _IDS_SHOWN = 12
 
 
@@ -143,9 +145,12 @@ def _steady(survey: Survey) -> Ability:
     if lacks:
         rest = "; speed, current and torque can be watched" if survey.rows else ""
         return Ability(name, False, f"the map has not {' and not '.join(lacks)}{rest}")
-    if survey.dq < _SHARE_NEEDED * survey.rows or not survey.rows:
+    if survey.dq < min(_SHARE_NEEDED * survey.rows, _ENOUGH) or not survey.rows:
+        turned = any(form != "dq" for form in forms) and survey.rows > 0
         return Ability(name, False, f"{_few(survey.dq, survey.rows)} of the samples have current, voltage "
-                       "and speed in the rotor's frame, reported near enough in time")
+                       "and speed in the rotor's frame, reported near enough in time"
+                       + (": map currents and voltages that are reported in d and q, if there are any" if turned
+                          else ""))
     return Ability(name, True, f"{survey.dq} samples with current, voltage and speed in the rotor's frame")
 
 
@@ -238,4 +243,3 @@ def _few(part: int, whole: int) -> str:
 
 def _hertz(turning: float) -> str:
     return f"{turning / (2.0 * math.pi):.3g} Hz"
-

@@ -116,7 +116,10 @@ def judge(found: list[Parameter], config: DriveConfig, why: Callable[[str], str]
             checked.append(Checked(p.name, "untold", why(p.name)))
         else:
             words = f"{factor * p.value:.4g} {unit}, {100.0 * p.share:+.1f} % against drive.toml"
-            checked.append(Checked(p.name, "found" if p.off else "fine", words))
+            # beyond what is allowed, and not surely so: that is not fine
+            unsure = not p.off and abs(p.share) > p.limit
+            checked.append(Checked(p.name, "found" if p.off else "untold" if unsure else "fine",
+                                   f"{words}, but not surely" if unsure else words))
     return findings, checked
 
 
