@@ -120,18 +120,3 @@ def test_a_brake_holds_the_load_until_the_loop_is_closed() -> None:
 def test_at_standstill_a_linear_machine_is_waited_for(source: str) -> None:
     result = slice_of(Profile(((0.0, 0.0),), ((0.0, 0.0),), 0.6), {"angle_source": "companion"}, source)
     assert [state for _, state in result.states] == [AngleState.HOLD]
-
-
-def test_a_slower_drive_keeps_its_loop_from_rest() -> None:
-    """Holding its current at zero at 2 kHz its control amplifies the probing signal three times, which is cut
-    back for that; once the loop is closed it has to be raised again, before sigma is too large."""
-    parameters = DriveParameters(sample_rate=2000.0, current_bandwidth=150.0, saturation=0.2, torque_limit=T,
-                                 angle_source="companion", estimate_time_to_live=0.03)
-    track = Profile(((0.0, 0.0), (1.3, 0.0), (1.9, 500.0 * RPM), (2.1, 500.0 * RPM)))
-    simulation = DriveSimulation(M2, parameters, track, 1.7)
-    drive = DriveNode(Protocol(), 0, simulation, DriveNodeSettings())
-    companion = Companion([config_from({"motor": {"preset": "m2"}})], Protocol(), transmit=True)
-    cosim = CoSimulation([drive], companion, BusFaults(delay_ns=1_000_000, jitter_ns=1_000_000, seed=1), 1e-3)
-    cosim.run(2.1)
-    truth = cosim.recording.truth[0]
-    assert truth[-1].omega_e[-1] / M2.pole_pairs == pytest.approx(500.0 * RPM, rel=0.05)

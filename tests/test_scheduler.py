@@ -139,7 +139,7 @@ def test_no_samples_stop_it_at_once() -> None:
     assert s.told == ("RAMP_UP", "LOW_SPEED")
 
 
-def test_current_limit_in_proportion_and_slowly_back_unless_the_current_answers_less() -> None:
+def test_current_limit_in_proportion_and_slowly_back() -> None:
     s = Stand()
     s.go(10)
     s.current = 0.7
@@ -153,13 +153,10 @@ def test_current_limit_in_proportion_and_slowly_back_unless_the_current_answers_
     s.go(5)
     assert s.told == ("LIMITED", "CURRENT_LIMIT")
     assert s.scheduler.amplitude == pytest.approx(3.0)
-    s.current = 0.3  # a little room: a tenth of the amplitude per second
+    s.current = 0.1  # room again: a tenth of the amplitude per second
     s.go(50)
     assert s.scheduler.amplitude == pytest.approx(3.0 + 0.6, abs=0.02)
-    s.current = 0.27  # much
-    s.go(5)
-    assert 3.6 * 1.3 < s.scheduler.amplitude < 3.6 * 1.6
-    s.go(5)
+    s.go(500)
     assert s.told == ("ON", "LOW_SPEED")
     assert s.scheduler.amplitude == 6.0
 

@@ -25,9 +25,6 @@ _PATIENCE = 0.1
 _ROOM = 0.6
 _RECOVERY = 0.1
 """Share of the way back to full amplitude per second once the current is below its limit again."""
-_FAR, _FAST_RECOVERY = 0.8, 4.0
-"""Below this share of the limit the amplitude comes back by so much of itself per second: the current answers less
-than it did, as where a drive that held its current at zero and amplified the probing signal closed its loop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,8 +222,7 @@ class InjectionScheduler:
             # In proportion, from what is injected now: the machine is linear in the small.
             self._share = min(self._share, self.amplitude / self.settings.amplitude * limit / current)
         elif current < 0.9 * limit:
-            rise = _RECOVERY if current > _FAR * limit else max(_RECOVERY, _FAST_RECOVERY * self._share)
-            self._share = min(1.0, self._share + rise * elapsed)
+            self._share = min(1.0, self._share + _RECOVERY * elapsed)
         return self._share
 
     def _follow(self, before: float, target: float, reason: InjectionReason) -> None:

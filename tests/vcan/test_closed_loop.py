@@ -18,7 +18,7 @@ preset = "m2"
 current_limit = 0.6
 [simulation]
 sample_rate = "2 kHz"
-current_bandwidth = 150
+current_bandwidth = 60
 angle_source = "companion"
 saturation = 0.2
 torque_limit = 6.2
